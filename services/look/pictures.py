@@ -50,8 +50,8 @@ SHOWN_ROLES = ("input", "mirror")
 PATCH, ABOUT = " patch", "patch about the object"
 """Ends the name of a patch's picture, and the words for it."""
 
-CHEQUERS, CHEQUERED = (172, 186), 16
-"""The greys behind transparent pictures, from which white and black things differ, and how many squares are in a row."""
+CHEQUERS, CHEQUERED = (114, 126), 16
+"""The greys behind transparent pictures, from which white, grey and black things differ, and how many squares are in a row."""
 
 STRIP_WIDTH, STRIP_COLUMNS, STRIP_ROWS = 960, 6, 2
 """Of a strip of a named camera's views: pixels, and how many views stand beside and below one another at most."""
