@@ -244,11 +244,19 @@ class _Placed:
     def fit_m(self, share: float, k: Intrinsics) -> float:
         """Distance from which the bounding sphere covers this share of the picture, and no edge cuts it off.
 
-        A sphere of radius R at distance d is drawn as a disc of radius f R / sqrt(d^2 - R^2) about the optical axis.
+        A sphere of radius R at distance d is drawn about the principal point as an ellipse of the half axes fx t and fy t,
+        with t = R / sqrt(d^2 - R^2). Raises ViewError `not_framed` where the principal point is outside of the picture.
         """
-        focal, edge = min(k.fx, k.fy), INSIDE * 0.5 * min(k.width, k.height)
-        disc = min(math.sqrt(share * k.width * k.height / math.pi), edge)
-        return self.radius_m * math.hypot(1.0, focal / disc)
+        edge = min(min(k.cx, k.width - k.cx) / k.fx, min(k.cy, k.height - k.cy) / k.fy)
+        if edge <= 0.0:
+            raise ViewError(
+                "not_framed",
+                f"the principal point ({k.cx:g}, {k.cy:g}) is not within the {k.width} x {k.height} pixels, so that radius_m fit "
+                "frames nothing: give radius_m in metres, or set cx and cy",
+            )
+        return self.radius_m * math.hypot(
+            1.0, 1.0 / min(math.sqrt(share * k.width * k.height / (math.pi * k.fx * k.fy)), INSIDE * edge)
+        )
 
 
 def _stands(entry: More, rng: np.random.Generator, placed: _Placed, k: Intrinsics, first: Camera) -> Iterator[Pose]:
