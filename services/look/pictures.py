@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import count, cycle, takewhile
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageFilter
@@ -50,8 +49,8 @@ SHOWN_ROLES = ("input", "mirror")
 PATCH, ABOUT = " patch", "patch about the object"
 """Ends the name of a patch's picture, and the words for it."""
 
-CHEQUERS, CHEQUERED = (172, 186), 16
-"""The greys behind transparent pictures, from which white and black things differ, and how many squares are in a row."""
+CHEQUERS, CHEQUERED = (114, 126), 16
+"""The greys behind transparent pictures, from which white, grey and black things differ, and how many squares are in a row."""
 
 STRIP_WIDTH, STRIP_COLUMNS, STRIP_ROWS = 960, 6, 2
 """Of a strip of a named camera's views: pixels, and how many views stand beside and below one another at most."""
@@ -181,9 +180,11 @@ def shrink(pixels: NDArray, width: int = MOST_WIDTH) -> NDArray:
     """An image at most so many pixels wide: colours are averaged, of depths, regions and codes some are left out."""
     if pixels.shape[1] <= width:
         return pixels
-    size = width, max(1, round(pixels.shape[0] * width / pixels.shape[1]))
-    is_colour = pixels.ndim == 3 and pixels.dtype == np.uint8
-    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA if is_colour else cv2.INTER_NEAREST)
+    height = max(1, round(pixels.shape[0] * width / pixels.shape[1]))
+    if pixels.ndim == 3 and pixels.dtype == np.uint8:
+        return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
+    rows, columns = (np.arange(n) * whole // n for n, whole in zip((height, width), pixels.shape[:2], strict=True))
+    return pixels[rows[:, None], columns]
 
 
 def _palette() -> list[int]:
