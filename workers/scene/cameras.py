@@ -232,7 +232,7 @@ class _Placed:
         points = np.concatenate([transform(T, each.hull.vertices) for each, T in zip(plan.objects, poses, strict=True)])
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
         radius_m = float(np.linalg.norm(points - middle, axis=1).max())
-        side_m = max(float(start.asset.extents_m.max()) for start in plan.objects)
+        side_m = float(np.ptp(points, axis=0).max())  # as it lies: published methods measure it after they placed it
         return cls(middle, radius_m, side_m, _centre_of(plan))
 
     def point(self, about: str | tuple[float, float, float]) -> Array:

@@ -84,11 +84,15 @@ def beside_transform(entry: Entry) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What cameras are placed about: points [N, 3] of the objects at rest, world; their longest side; the table's height."""
+    """What cameras are placed about: points [N, 3] of the objects at rest, world; the table's height."""
 
     points: Array
-    side_m: float
     top_m: float
+
+    @property
+    def side_m(self) -> float:
+        """Of the box of the objects as they lie, the longest."""
+        return float(np.ptp(self.points, axis=0).max())
 
     @property
     def middle(self) -> Array:

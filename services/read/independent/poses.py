@@ -120,10 +120,8 @@ def _subject(pair: StoredPair) -> Subject:
     world = {region: (shape.points.reshape(-1, 3), T) for region, shape, T in things_of(pair)}
     at = {region: points @ T[:3, :3].T + T[:3, 3] for region, (points, T) in world.items()}
     objects = [region for region in world if region >= FIRST_OBJECT]
-    side_m = max(float(np.ptp(world[region][0], axis=0).max()) for region in objects)
-    return Subject(
-        np.concatenate([at[region] for region in objects]), side_m, float(at[TABLE][:, 2].max()) if TABLE in at else 0.0
-    )
+    top_m = float(at[TABLE][:, 2].max()) if TABLE in at else 0.0
+    return Subject(np.concatenate([at[region] for region in objects]), top_m)
 
 
 def _derive_d_z(pair: StoredPair) -> float:

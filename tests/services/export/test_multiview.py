@@ -324,3 +324,10 @@ def test_without_further_cameras_an_object_on_a_table_is_cut_out_of_its_pairs(tm
         np.testing.assert_array_equal(
             shot.rgba[..., 3], np.where(read_picture(store.root / "can" / f"{word}.png") == 3, 255, 0)
         )
+
+
+def test_point_completion_has_a_partial_cloud_of_every_view(studio, tmp_path):
+    manifest = export_to(studio, tmp_path / "new", "pcn").manifest
+    assert sum(manifest["partial"].values()) == 3 * (1 + COUNT + 2)
+    with (tmp_path / "new" / "views.csv").open() as file:
+        assert {row["role"] for row in csv.DictReader(file)} >= {"input", "around_003", "near_001", "right_000"}

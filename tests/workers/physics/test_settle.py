@@ -389,6 +389,20 @@ def test_only_thin_walls_that_may_lie_in_one_another_fall_as_coarser_parts(bodie
     assert given and all(most / 10 < max(counts) < most for counts in given)
 
 
+def test_six_cups_come_to_rest_one_after_the_other_and_only_neighbours_are_compared_when_let_go(monkeypatch):
+    """A cup's wall is in the box of each cup within its height, and touches those of the next alone. Here they stay."""
+    apart = []
+
+    def stayed(bodies, poses, *more, **named):
+        apart.append(set(more[4].apart))
+        return Outcome(tuple(poses), 0.0, 0.0, True)
+
+    monkeypatch.setattr(holding, "fall", stayed)
+    group = cups(6)
+    settle_group(group.starts, group.table, PHYSICS)
+    assert apart == [{(i, j) for j in range(6) for i in range(j - 1)}]
+
+
 def test_letting_go_ends_at_its_budget_and_names_the_objects(monkeypatch):
     monkeypatch.setattr(settle, "LET_GO_COST", 0.0)
     group = cups(2)
