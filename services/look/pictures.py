@@ -52,8 +52,8 @@ PATCH, ABOUT = " patch", "patch about the object"
 CHEQUERS, CHEQUERED = (114, 126), 16
 """The greys behind transparent pictures, from which white, grey and black things differ, and how many squares are in a row."""
 
-STRIP_WIDTH, STRIP_COLUMNS, STRIP_ROWS = 960, 6, 2
-"""Of a strip of a named camera's views: pixels, and how many views stand beside and below one another at most."""
+STRIP_WIDTH, STRIP_COLUMNS, STRIP_ROWS, GAP = 960, 6, 2, 2
+"""Of a strip of a named camera's views: pixels, how many views stand beside and below one another at most, pixels between."""
 
 TURNED_WIDTH, MOST_TURNED, ROUND_MS = 280, 60, 4000
 """Of a turning picture: pixels, views at most, and milliseconds that one round takes."""
@@ -276,7 +276,7 @@ def show_camera(views: NamedViews, kinds: Collection[PixelKind] | None = None) -
     columns = min(count // 2, STRIP_COLUMNS) if count > STRIP_COLUMNS else count
     chosen = [views[place] for place in spread_evenly(len(views), count - count % columns)]
     read = [_read_images(view, kinds) for view in chosen]
-    tile = min(MOST_WIDTH, STRIP_WIDTH // columns)
+    tile = min(MOST_WIDTH, STRIP_WIDTH // columns - GAP)
     strips = {kind: _tiled([shrink(images[kind], tile) for images in read], columns) for kind in read[0]}
     name, units_per_m = chosen[0].role, chosen[0].depth_units_per_m
     return ShownCamera(
@@ -285,8 +285,8 @@ def show_camera(views: NamedViews, kinds: Collection[PixelKind] | None = None) -
 
 
 def _tiled(images: Sequence[NDArray], columns: int) -> NDArray:
-    """Images beside and below one another, in rows of so many; 0 beside smaller ones."""
-    height, width = (max(sizes) for sizes in zip(*(image.shape[:2] for image in images), strict=True))
+    """Images beside and below one another, in rows of so many; 0 between them and beside smaller ones."""
+    height, width = (max(sizes) + GAP for sizes in zip(*(image.shape[:2] for image in images), strict=True))
     tiled = np.zeros((height * (len(images) // columns), width * columns, *images[0].shape[2:]), images[0].dtype)
     for place, image in enumerate(images):
         top, left = height * (place // columns), width * (place % columns)

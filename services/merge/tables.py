@@ -359,7 +359,7 @@ MOST_LICENCES = 10
 
 
 def describe_sources(catalogue: "Catalogue") -> list[str]:
-    """One line for each source of objects and of tables with its licence, and those of `Catalogue.describe_left_out`."""
+    """One line for each source of objects and of tables with its licence, and what was left out or has no colour."""
     lines = []
     for what, sources, libraries in (
         ("objects", catalogue.assets.objects, catalogue.objects),
@@ -373,4 +373,4 @@ def describe_sources(catalogue: "Catalogue") -> list[str]:
                 most = ", ".join(f"{name} ({count})" for name, count in library.licences.most_common(MOST_LICENCES))
                 origin = f"library {source.folder}, licences {most}"
             lines.append(f"{what}, weight {source.weight:g}: {origin}")
-    return lines + catalogue.describe_left_out()
+    return [*lines, *catalogue.describe_left_out(), *catalogue.describe_plain()]

@@ -136,9 +136,13 @@ class Catalogue:
             if library.skipped
         ]
 
+    def describe_plain(self) -> list[str]:
+        """One line for each folder with shapes that no file gives a picture or a colour."""
+        return [f"{library.source}: {message}" for library in self.libraries() for message in library.plain]
+
     def describe_doubts(self) -> list[str]:
         """Lines on each folder with files that stand on another axis than was decided, or that have no colour."""
-        lines = [f"{library.source}: {message}" for library in self.libraries() for message in library.plain]
+        lines = self.describe_plain()
         for library in self.libraries():
             if not library.doubts:
                 continue
