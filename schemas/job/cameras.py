@@ -304,13 +304,9 @@ class More(Frozen):
     @property
     def count(self) -> int | None:
         """Views in a scene, or for `beside` in a pair; None where a file says it."""
-        return (
-            None
-            if self.poses is not None
-            else 1
-            if self.beside is not None
-            else sum(each.count for each in self.orbits)
-        )
+        if self.poses is not None:
+            return None
+        return 1 if self.beside is not None else sum(each.count for each in self.orbits)
 
 
 class ViewPreset(NamedTuple):
@@ -337,12 +333,15 @@ def _direction(yaw_deg: float, elevation_deg: float, radius_m: float) -> Ring:
     )
 
 
+LENS_35_OF_32_DEG = 2.0 * math.degrees(math.atan(0.5 * 32.0 / 35.0))
+"""Horizontal field of view of Blender's lens of 35 mm before 32 mm."""
+
 VIEW_PRESETS: Mapping[str, ViewPreset] = {
-    # cvlab-columbia/zero123, objaverse-rendering/scripts/blender_script.py (lens 35 of 32 mm) and ldm/data/simple.py.
-    "zero123": ViewPreset(49.1343, "side", 1.0, (Sphere(count=12, pattern="cube", radius_m=(1.5, 2.2)),)),
+    # cvlab-columbia/zero123, objaverse-rendering/scripts/blender_script.py and ldm/data/simple.py.
+    "zero123": ViewPreset(LENS_35_OF_32_DEG, "side", 1.0, (Sphere(count=12, pattern="cube", radius_m=(1.5, 2.2)),)),
     # liuyuan-pal/SyncDreamer, blender_script.py and meta_info/camera-16.pkl: the sixteen targets.
     "syncdreamer": ViewPreset(
-        49.1343,
+        LENS_35_OF_32_DEG,
         "side",
         1.0,
         (Ring(count=16, inclination_rad=math.radians(30.0), radius_m=1.5),),

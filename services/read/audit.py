@@ -15,7 +15,7 @@ from scipy.stats import t as student_t
 
 from schemas.base import Pose
 from schemas.dataset.codec import Row
-from schemas.dataset.layout import is_shape, stored_images, stored_roles
+from schemas.dataset.layout import is_shape, stored_images, stored_roles, stored_shape
 from schemas.errors import CorruptError, InputError, SceneError, command_line, plural
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan, ObjectStart, Placed, PosedScene, SceneOutput
@@ -23,8 +23,8 @@ from schemas.scene.shape import Shape
 from schemas.scene.view import MODALITIES, Camera, View
 from services.job.record import read_success, require_job
 from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, committed_reader, file_reader, find_scene
-from services.read.independent.derive import Kind, StoredPair, check_forces
-from services.read.independent.poses import check_merged, check_pair, list_underived
+from services.read.independent.derive import Kind, StoredPair
+from services.read.independent.poses import check_forces, check_merged, check_pair, list_underived
 from services.read.replay import compare_files, compare_rows, is_same_stack, open_context
 from workers.geometry.camera import NEAR_M, project
 from workers.geometry.frames import invert, motion_between, transform
@@ -195,9 +195,11 @@ class IndependentVerdict:
 def stored_kinds(job: Job) -> dict[str, list[Kind]]:
     """The rows of the modalities that a job stores, by role, as the independent code takes them."""
     kinds = {}
-    for role in stored_roles(job):
+    for role in (*stored_roles(job), *(entry.name for entry in job.cameras.more)):
         images = ((image.content, MODALITIES[image.pixels]) for image in stored_images(role, job))
-        kinds[str(role)] = [Kind(m.name, word, m.dtype, m.channels, m.each, m.formula) for word, m in images]
+        kinds[str(role)] = [
+            Kind(m.name, word, m.dtype, (*stored_shape(m, 1, 1, job), 1)[2], m.each, m.formula) for word, m in images
+        ]
     return kinds
 
 
@@ -320,7 +322,7 @@ def _audit_scene(context: WorkerContext, store: Store, scene_id: int, audited: A
     audited.bytes += sum(len(file.data) for file in output.files)
     plain = None if audited.same_stack else make_forced(context, scene_id)[1]
     proven = _prove_no_ops(context, lambda now: _differences(store, stored, plain, now), output, no_ops, audited)
-    if approximations:
+    if approximations and scene.plan.ground is not None:  # nothing rests in a studio scene
         facts = Facts(context.job, scene.plan, scene.raycast_checked)
         effects = plan_effects(facts, names_of_kind("approximation"))
         motion = measure_motion(context, scene, effects)

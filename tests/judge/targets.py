@@ -14,10 +14,11 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import cast, get_args
 
 import yaml
 
+from schemas.dataset.layout import view_name
 from schemas.errors import SceneError
 from schemas.job.job import Job
 from schemas.job.views import ViewTarget
@@ -63,7 +64,11 @@ def pairs_of(job: Job, output: SceneOutput) -> Iterator[StoredPair]:
     files, keys = {file.path: file.data for file in output.files}, job.model_dump(mode="json")
     kinds = stored_kinds(job)
     for parent in dict.fromkeys(row["parent_id"] for row in output.rows["views"]):
-        views = {str(row["role"]): row for row in output.rows["views"] if row["parent_id"] == parent}
+        views = {
+            view_name(str(row["role"]), cast("int | None", row["number"])): row
+            for row in output.rows["views"]
+            if row["parent_id"] == parent
+        }
         ids = {row["pose_id"] for row in views.values()}
         objects = [row for row in output.rows["objects"] if row["pose_id"] in ids]
         yield StoredPair(keys, output.rows["scenes"][0], views, objects, files.__getitem__, kinds)

@@ -137,8 +137,8 @@ class Catalogue:
         ]
 
     def describe_doubts(self) -> list[str]:
-        """One line for each folder with files that stand on another axis than was decided."""
-        lines = []
+        """Lines on each folder with files that stand on another axis than was decided, or that have no colour."""
+        lines = [f"{library.source}: {message}" for library in self.libraries() for message in library.plain]
         for library in self.libraries():
             if not library.doubts:
                 continue

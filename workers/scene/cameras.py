@@ -92,13 +92,14 @@ def frame_cameras(job: Job, plan: ScenePlan, poses: Sequence[Pose]) -> ScenePlan
     """The plan with input cameras that frame its objects, where the orbit says so, in the directions that were drawn.
 
     poses: `T_world_obj` [4, 4] of each object.
-    Raises ViewError `not_framed` where a camera stands nearer to an object than the object is large, or where the objects do
-    not fit into the picture and the range of depth.
+    Raises ViewError `not_framed` where a camera at a given distance stands nearer to an object than the object is large, or
+    where the objects do not fit into the picture and the range of depth.
     """
     placed = list(zip(plan.objects, poses, strict=True))
     cameras = plan.input_cameras
     if job.cameras.orbit.share is not None:
-        cameras = tuple(_frame(job, plan, camera, placed, job.cameras.orbit.share) for camera in cameras)
+        framed = (_frame(job, plan, camera, placed, job.cameras.orbit.share) for camera in cameras)
+        return replace(plan, input_cameras=tuple(framed))
     for start, T in placed:
         box = start.asset.shape.bounds
         size, middle = float(np.linalg.norm(box[1] - box[0])), transform(T, box.mean(axis=0)[None, :])[0]
@@ -108,7 +109,7 @@ def frame_cameras(job: Job, plan: ScenePlan, poses: Sequence[Pose]) -> ScenePlan
                 f"{start.asset.instance_id} is {size:.3g} m across, and the input camera stands {near:.3g} m from its middle: "
                 "set cameras.orbit.radius_m: fit, or make the object smaller",
             )
-    return replace(plan, input_cameras=cameras)
+    return plan
 
 
 def _centre_of(plan: ScenePlan) -> Array:
@@ -231,7 +232,7 @@ class _Placed:
         points = np.concatenate([transform(T, each.hull.vertices) for each, T in zip(plan.objects, poses, strict=True)])
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
         radius_m = float(np.linalg.norm(points - middle, axis=1).max())
-        side_m = max(float(start.asset.extents_m.max()) for start in plan.objects)
+        side_m = float(np.ptp(points, axis=0).max())  # as it lies: published methods measure it after they placed it
         return cls(middle, radius_m, side_m, _centre_of(plan))
 
     def point(self, about: str | tuple[float, float, float]) -> Array:
@@ -243,11 +244,19 @@ class _Placed:
     def fit_m(self, share: float, k: Intrinsics) -> float:
         """Distance from which the bounding sphere covers this share of the picture, and no edge cuts it off.
 
-        A sphere of radius R at distance d is drawn as a disc of radius f R / sqrt(d^2 - R^2) about the optical axis.
+        A sphere of radius R at distance d is drawn about the principal point as an ellipse of the half axes fx t and fy t,
+        with t = R / sqrt(d^2 - R^2). Raises ViewError `not_framed` where the principal point is outside of the picture.
         """
-        focal, edge = min(k.fx, k.fy), INSIDE * 0.5 * min(k.width, k.height)
-        disc = min(math.sqrt(share * k.width * k.height / math.pi), edge)
-        return self.radius_m * math.hypot(1.0, focal / disc)
+        edge = min(min(k.cx, k.width - k.cx) / k.fx, min(k.cy, k.height - k.cy) / k.fy)
+        if edge <= 0.0:
+            raise ViewError(
+                "not_framed",
+                f"the principal point ({k.cx:g}, {k.cy:g}) is not within the {k.width} x {k.height} pixels, so that radius_m fit "
+                "frames nothing: give radius_m in metres, or set cx and cy",
+            )
+        return self.radius_m * math.hypot(
+            1.0, 1.0 / min(math.sqrt(share * k.width * k.height / (math.pi * k.fx * k.fy)), INSIDE * edge)
+        )
 
 
 def _stands(entry: More, rng: np.random.Generator, placed: _Placed, k: Intrinsics, first: Camera) -> Iterator[Pose]:

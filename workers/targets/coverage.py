@@ -1,7 +1,5 @@
 """Alpha: the share of each pixel that a scene without ground covers, of the same faces as its mask. Pure."""
 
-from typing import cast
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -26,36 +24,48 @@ def cover_pixels(triangles: Triangles, region: NDArray[np.uint8]) -> NDArray[np.
     Never 0 where the mask shows something, and never 255 where it does not: its sample is the pixel's centre. A pixel that, with
     all eight beside it, shows something is covered; of no such pixel a share is computed.
     """
-    inner = is_inner(region)
+    alpha = np.zeros(region.shape, np.uint8)
     u, v = project(triangles.mesh.vertices, triangles.intrinsics)
-    covered = np.zeros(region.shape, np.uint64)
-    _cover(np.stack([u, v], axis=1), triangles.mesh.faces, _next_open(inner.view(np.uint8)), _OFFSETS, covered)
-    alpha = _SHARES[np.bitwise_count(covered)]
-    alpha = np.where(region > 0, np.maximum(alpha, np.uint8(1)), np.minimum(alpha, np.uint8(254)))
-    alpha[inner] = 255
+    (top, bottom), (left, right) = (
+        np.clip([np.floor(at.min()) - 1.0, np.ceil(at.max()) + 1.0], 0.0, most).astype(int)
+        for at, most in zip((v, u), region.shape, strict=True)
+    )
+    if top >= bottom or left >= right:
+        return alpha
+    part = slice(top, bottom), slice(left, right)
+    inner, shown, covered = is_inner(region)[part], region[part] > 0, np.zeros((bottom - top, right - left), np.uint64)
+    # Of a closed body the faces that look away cover nothing but what the others do.
+    seen = ~triangles.closed | (triangles.planes[1] < 0.0)
+    faces = np.ascontiguousarray(triangles.mesh.faces[seen])
+    open_from = _next_open(np.ascontiguousarray(inner).view(np.uint8))
+    _cover(np.stack([u - left, v - top], axis=1), faces, open_from, _OFFSETS, covered)
+    share = _SHARES[np.bitwise_count(covered)]
+    share = np.where(shown, np.maximum(share, np.uint8(1)), np.minimum(share, np.uint8(254)))
+    share[inner] = 255
+    alpha[part] = share
     return alpha
 
 
 def with_alpha(rgb: NDArray[np.uint8], region: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """[H, W, 4]: colour with straight alpha. A pixel whose centre shows nothing has the colour of the nearest that does."""
-    image = cast(NDArray[np.uint8], cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA))
+    image = np.zeros((*alpha.shape, 4), np.uint8)
+    rows, columns = (np.flatnonzero(alpha.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        return image
+    part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    shown, there = region[part] > 0, alpha[part] > 0
+    colours = cv2.cvtColor(np.ascontiguousarray(rgb[part]), cv2.COLOR_RGB2RGBA).view(np.uint32)[:, :, 0]
+    if (beside := there & ~shown).any() and shown.any():
+        # Every pixel that shows something has a number of its own.
+        _, nearest = cv2.distanceTransformWithLabels(
+            (~shown).view(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        colour_of = np.zeros(int(nearest.max()) + 1, np.uint32)
+        colour_of[nearest[shown]] = colours[shown]
+        colours[beside] = colour_of[nearest[beside]]
+    colours[~there] = 0
+    image[part] = colours.view(np.uint8).reshape(*there.shape, 4)
     image[:, :, 3] = alpha
-    pixels = image.view(np.uint32)[:, :, 0]
-    pixels[alpha == 0] = 0
-    rows, columns = np.nonzero((alpha > 0) & (region == 0))
-    if len(rows) and (region > 0).any():
-        # Of the part about these pixels alone; every one that shows something has a number of its own there.
-        part = slice(max(rows.min() - 2, 0), rows.max() + 3), slice(max(columns.min() - 2, 0), columns.max() + 3)
-        shown, seen = region[part] > 0, pixels[part]
-        if shown.any():
-            _, nearest = cv2.distanceTransformWithLabels(
-                (~shown).view(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-            )
-            colours = np.zeros(int(nearest.max()) + 1, np.uint32)
-            colours[nearest[shown]] = seen[shown]
-            beside = rows - part[0].start, columns - part[1].start
-            near = colours[nearest[beside]].view(np.uint8).reshape(-1, 4)
-            image[rows, columns, :3] = near[:, :3]
     return image
 
 

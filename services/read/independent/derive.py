@@ -1,4 +1,4 @@
-"""Cameras, labels, projection and forces of stored scenes by the definitions of Staszak and Belter 2024.
+"""Cameras, labels and projection of stored scenes, and their shapes, by the definitions of Staszak and Belter 2024.
 
 Matrices are [4, 4] float64, `T_a_b` takes frame b to frame a, metres; camera frames are optical (x right, y down, z
 forward). A pixel (column, row) has its centre at (column + 0.5, row + 0.5).
@@ -7,14 +7,15 @@ forward). A pixel (column, row) has its centre at (column + 0.5, row + 0.5).
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.read.independent.rays import Array, Row
+from services.read.independent.cameras import sensor_of
+from services.read.independent.rays import Array, Faces, Row, bare_faces, place_shapes, read_shape
 
 ROUNDING = 1e-9
 """Largest difference of poses, distances and angles (metres, radians) between two orders of the same arithmetic."""
@@ -34,7 +35,15 @@ TIE_M = 1e-12
 MOST_BROKEN_TIES = 0.25
 """Share of tied pixels that may show another point: rounding breaks some 4 %, another rule more than half."""
 
+FLOOR_M = 1e4
+"""Half the side of a floor, or of a capture's board, which are in no file: planes, whose colour is not judged."""
+
 FLOOR, TABLE, FIRST_OBJECT = 1, 2, 3
+
+
+def name_of(row: Row) -> str:
+    """The name of a view within its pair, of a row of `views` or `objects`: its role, of a camera by name `around_003`."""
+    return row["role"] if row["number"] is None else f"{row['role']}_{row['number']:03d}"
 
 
 def beside(job: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -60,7 +69,7 @@ class Kind:
 
 @dataclass(frozen=True)
 class StoredPair:
-    """The job's keys, the rows of one pair (views by role), and a function that reads a file by its path."""
+    """The job's keys, the rows of one pair (views by name), and a function that reads a file by its path."""
 
     job: Mapping[str, Any]
     scene: Row
@@ -70,7 +79,7 @@ class StoredPair:
     stored: Mapping[str, Sequence[Kind]]
     """By role, what the job stores of a view."""
     images: dict[tuple[str, str], NDArray] = field(default_factory=dict)
-    """Decoded images by role and kind of pixel."""
+    """Decoded images by the view's name and kind of pixel."""
     shapes: dict[str, Any] = field(default_factory=dict)
     """Shapes that were read, by path; `floor`, which is in no file, where it is known."""
     findings: list[Any] = field(default_factory=list)
@@ -84,10 +93,26 @@ class StoredPair:
         return self.job.get("captures") is not None
 
     @property
-    def sensor(self) -> Mapping[str, Any]:
-        """The pinhole camera of every view: the job's, of captures the photograph's."""
-        sensor = self.job["cameras"]["sensor"]
-        return {name: self.views["input"][name] for name in sensor} if self.is_captured else sensor
+    def is_studio(self) -> bool:
+        """Whether the object stands alone: there is no table and no floor, and nothing holds it."""
+        return bool(self.job.get("scene") == "studio")
+
+    @property
+    def named(self) -> dict[str, Mapping[str, Any]]:
+        """The job's further cameras by name."""
+        return {entry["name"]: entry for entry in self.job["cameras"].get("more", ())}
+
+    def labels(self, view: Row) -> dict[int, Row]:
+        """The rows of `objects` of a view, by region."""
+        return {row["region_id"]: row for row in self.objects if name_of(row) == name_of(view)}
+
+    def sensor(self, view: Row) -> Mapping[str, Any]:
+        """The pinhole camera of a view: the job's, of captures the photograph's; nothing where a table of poses may say it."""
+        sensor: Mapping[str, Any] = self.job["cameras"]["sensor"]
+        if self.is_captured:
+            return {name: self.views["input"][name] for name in sensor}
+        entry = self.named.get(view["role"])
+        return sensor if entry is None else sensor_of(entry, sensor)
 
     @property
     def targets(self) -> Mapping[str, Any]:
@@ -121,8 +146,43 @@ class StoredPair:
         own = own_region(kind)
         word = self.kinds(view["role"])[kind].word
         region = patch_of or own
-        suffix = f"obj{region - FIRST_OBJECT}" if region and len(self.regions) > 1 else ""
+        suffix = "" if view["number"] is None else f"_{view['number']:03d}"
+        suffix += f"obj{region - FIRST_OBJECT}" if region and len(self.regions) > 1 else ""
         return f"{view['category']}/{'patches/' if patch_of else ''}{word}{number:05d}{suffix}.png"
+
+
+def faces_of(pair: StoredPair, view: Row) -> Faces:
+    """Floor, table and objects, or board and object, in the camera's frame. Raises FileNotFoundError without a shape's file.
+
+    Targets of a capture are of the stored corners, and not of those before rounding.
+    """
+    T_cam_world = np.asarray(np.linalg.inv(matrix(view, "T_world_cam")), np.float64)
+    plane = TABLE if pair.is_captured else FLOOR
+    placed = [] if pair.is_studio else [(plane, pair.shapes.get("floor") or _plane(), T_cam_world)]
+    return place_shapes(placed + [(region, shape, T_cam_world @ T) for region, shape, T in things_of(pair)])
+
+
+def things_of(pair: StoredPair) -> list[tuple[int, Faces, Array]]:
+    """The table, where there is one, and the objects: (region, shape, pose [4, 4] in the world). Raises as `faces_of`."""
+    scene, things = pair.scene, list[tuple[int, Faces, Array]]()
+    table = {"region_id": TABLE, "category": "table", "instance_id": scene["table_id"]}
+    on_table = not pair.is_captured and not pair.is_studio
+    for body in (*([table] if on_table else []), *pair.bodies):
+        path = f"assets/{body['category']}/{body['instance_id']}.glb"
+        if path not in pair.shapes:
+            shape = read_shape(pair.read(path))
+            rounding_m = shape.rounding_m * (not pair.is_captured)
+            pair.shapes[path] = replace(shape, rounding_m=rounding_m)
+        T_world = matrix(scene, "T_world_table") if body is table else matrix(body, "T_world_obj")
+        things.append((body["region_id"], pair.shapes[path], T_world))
+    return things
+
+
+def _plane() -> Faces:
+    """A floor or a board, without a colour."""
+    corners = FLOOR_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    points = corners[[[0, 1, 2], [0, 2, 3]]]
+    return replace(bare_faces(points), normals=np.broadcast_to([0.0, 0.0, 1.0], points.shape))
 
 
 def own_region(kind: str) -> int | None:
@@ -132,10 +192,10 @@ def own_region(kind: str) -> int | None:
 
 def check_images(pair: StoredPair, view: Row) -> Iterator[str]:
     """Decode the view's images; type, size, and every file's size and digest in its row."""
-    role, size = view["role"], (view["height"], view["width"])
-    for name, kind in pair.kinds(role).items():
+    size = (view["height"], view["width"])
+    for name, kind in pair.kinds(view["role"]).items():
         path = pair.path(view, name)
-        image = pair.images[role, name] = _decode(pair.read(path))
+        image = pair.images[name_of(view), name] = _decode(pair.read(path))
         shape = size if kind.channels == 1 else (*size, kind.channels)
         if image.dtype != np.dtype(kind.dtype) or image.shape != shape:
             yield f"{path}: is {image.dtype} {image.shape}, and must be {kind.dtype} {shape}"
@@ -147,14 +207,14 @@ def check_images(pair: StoredPair, view: Row) -> Iterator[str]:
 
 def check_camera(pair: StoredPair, view: Row) -> Iterator[str]:
     """Ids, intrinsics in both conventions, a rigid pose, and its angles."""
-    pairs, sensor, parent = pair.job["pairs_per_scene"], pair.sensor, view["parent_id"]
+    pairs, sensor, parent = pair.job["pairs_per_scene"], pair.sensor(view), view["parent_id"]
     first = 2 * pairs * pair.scene["scene_id"]
     if parent not in range(first, first + 2 * pairs, 2) or view["pose_id"] != parent + (view["role"] == "mirror"):
         yield f"ids {view['pose_id']} and {parent} do not follow from scene {pair.scene['scene_id']}"
     units = pair.job["images"]["depth_units_per_m"]
-    derived = {"cx_opencv": sensor["cx"] - 0.5, "cy_opencv": sensor["cy"] - 0.5, "depth_units_per_m": units}
-    for name, value in {**sensor, **derived}.items():
-        if view[name] != value:
+    derived = {"cx_opencv": view["cx"] - 0.5, "cy_opencv": view["cy"] - 0.5, "depth_units_per_m": units}
+    for name, value in {**derived, **sensor}.items():
+        if abs(view[name] - value) > 1e-12 * abs(value):
             yield f"{name} is {view[name]}, the {'input view' if pair.is_captured else 'job'} gives {value}"
     T = matrix(view, "T_world_cam")
     R, axis = T[:3, :3], T[:3, 2]
@@ -170,7 +230,7 @@ def check_camera(pair: StoredPair, view: Row) -> Iterator[str]:
 
 def check_depth(pair: StoredPair, view: Row) -> Iterator[str]:
     """Depth is z in units within the stored range, none where nothing was hit; floor pixels lie at height 0."""
-    depth, region = pair.images[view["role"], "depth"], pair.images[view["role"], "region"]
+    depth, region = pair.images[name_of(view), "depth"], pair.images[name_of(view), "region"]
     units, (low, high) = view["depth_units_per_m"], pair.job["images"]["depth_range_m"]
     some = depth[depth > 0]
     if len(some) and not (low * units - 0.5 <= some.min() and some.max() <= high * units + 0.5):
@@ -188,13 +248,20 @@ def check_depth(pair: StoredPair, view: Row) -> Iterator[str]:
 
 def check_labels(pair: StoredPair, view: Row) -> Iterator[str]:
     """Regions, pixel counts, boxes, object poses and image coordinates."""
-    region, scene = pair.images[view["role"], "region"], pair.scene
+    region, labels = pair.images[name_of(view), "region"], pair.labels(view)
     poses = {body["region_id"]: matrix(body, "T_world_obj") for body in pair.bodies}
-    poses[TABLE] = matrix(scene, "T_world_table")
-    labels = {row["region_id"]: row for row in pair.objects if row["role"] == view["role"]}
+    if not pair.is_studio:
+        poses[TABLE] = matrix(pair.scene, "T_world_table")
     if labels.keys() != poses.keys() or not set(np.unique(region).tolist()) <= {0, FLOOR, *poses}:
         yield f"regions are {sorted(labels)} in objects, {sorted(poses)} in scenes, {np.unique(region)} in the mask"
         return
+    rgb = pair.images.get((name_of(view), "rgb"), region)
+    if (
+        rgb.ndim == 3
+        and rgb.shape[2] == 4
+        and ((rgb[..., 3] == 0) & (region > 0) | (rgb[..., 3] == 255) & (region == 0)).any()
+    ):
+        yield "alpha is 0 where the mask shows something, or 255 where it does not"
     if view["object_pixels"] != np.count_nonzero(region >= FIRST_OBJECT):
         yield f"object_pixels {view['object_pixels']} is not the number of pixels of objects"
     for number, label in labels.items():
@@ -220,10 +287,15 @@ def _shows_origin(view: Row, label: Row, T_cam_obj: Array) -> bool:
 
 
 def check_patches(pair: StoredPair, view: Row) -> Iterator[str]:
-    """Each patch is the crop centred on an object's (u, v), and is left out where it would leave the image."""
+    """Each patch is the crop centred on an object's (u, v), and is left out where it would leave the image.
+
+    Views of further cameras have none.
+    """
     role, size = view["role"], pair.job["images"]["patch"]
-    seen_from = "mirror" if role == "projected" else role
-    labels = [row for row in pair.objects if row["role"] == seen_from and row["region_id"] >= FIRST_OBJECT]
+    seen_from = pair.views["mirror" if role == "projected" else name_of(view)]
+    labels = [
+        row for region, row in pair.labels(seen_from).items() if region >= FIRST_OBJECT and role not in pair.named
+    ]
     stored = {file["path"] for file in view["files"]}
     expected = {pair.path(view, kind) for kind in pair.kinds(role)}
     for label in labels:
@@ -235,7 +307,7 @@ def check_patches(pair: StoredPair, view: Row) -> Iterator[str]:
         for kind in (kind for kind in pair.kinds(role) if own_region(kind) in (None, label["region_id"])):
             path = pair.path(view, kind, label["region_id"])
             expected.add(path)
-            crop = pair.images[role, kind][top:bottom, left:right]
+            crop = pair.images[name_of(view), kind][top:bottom, left:right]
             if path in stored and not np.array_equal(_decode(pair.read(path)), crop):
                 yield f"{path} is not the crop about ({label['u']}, {label['v']})"
     if different := expected ^ stored:
@@ -275,9 +347,11 @@ def check_projection(pair: StoredPair) -> Iterator[str]:
 
 
 def _decode(data: bytes) -> NDArray:
-    """[H, W] or [H, W, 3] RGB; empty where the bytes are no image."""
+    """[H, W], [H, W, 3] RGB or [H, W, 4] RGBA; empty where the bytes are no image."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    return np.zeros(0) if image is None else image[..., ::-1] if image.ndim == 3 else image
+    if image is None or image.ndim < 3:
+        return np.zeros(0) if image is None else image
+    return image[..., [2, 1, 0, 3][: image.shape[2]]]
 
 
 def matrix(row: Row, name: str) -> Array:
@@ -296,59 +370,3 @@ def unproject(view: Row, depth: NDArray) -> tuple[Array, NDArray[np.int64]]:
     z = depth[rows, columns] / view["depth_units_per_m"]
     x, y = (columns + 0.5 - view["cx"]) / view["fx"] * z, (rows + 0.5 - view["cy"]) / view["fy"] * z
     return np.stack([x, y, z, np.ones_like(z)]), rows * view["width"] + columns
-
-
-GRAVITY_M_S2 = 9.81
-
-SHARE = 0.01
-"""Of a weight, or of a weight at the lever of the farthest contact: what may be without balance."""
-
-
-def check_forces(job: Mapping[str, Any], scene: Row) -> Iterator[str]:
-    """What the forces of a scene's contacts do not explain, a sentence each."""
-    bodies = scene["bodies"]
-    if not bodies or job.get("captures") is not None or not job["physics"]["exact_rest"]:
-        return
-    friction = job["physics"]["friction"] ** 2
-    for body in bodies:
-        for fault in _check_body(body, friction):
-            yield f"scene {scene['scene_id']}, region {body['region_id']}: {fault}"
-    yield from (f"scene {scene['scene_id']}: {fault}" for fault in _check_reactions(bodies))
-
-
-def _check_body(body: Row, friction: float) -> Iterator[str]:
-    contacts = body["contacts"]
-    if not contacts:
-        yield "nothing holds it"
-        return
-    force, normal, point = (np.array([contact[name] for contact in contacts]) for name in ("force", "normal", "point"))
-    weight, lever = body["mass_kg"] * GRAVITY_M_S2, point - np.array(body["com"])
-    left = np.linalg.norm(force.sum(axis=0) - [0.0, 0.0, weight]) / weight
-    turning = np.linalg.norm(np.cross(lever, force).sum(axis=0)) / (weight * np.linalg.norm(lever, axis=1).max())
-    if not left <= SHARE:
-        yield f"its contact forces leave {left:.1%} of its weight over"
-    if not turning <= SHARE:
-        yield f"its contact forces turn it, by {turning:.1%} of its weight at the lever of its farthest contact"
-    if not np.allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-9):
-        yield "a normal of a contact has not the length 1"
-    pressed = (force * normal).sum(axis=1)
-    slipping = np.linalg.norm(force - pressed[:, None] * normal, axis=1)
-    if (pressed < -ROUNDING * weight).any():
-        yield "a contact pulls"
-    if (slipping > friction * pressed + ROUNDING * weight).any():
-        yield f"a contact needs more than its friction of {friction:g}"
-
-
-def _check_reactions(bodies: list[Row]) -> Iterator[str]:
-    """Two bodies press one another with one force at one point."""
-    forces = dict[tuple[int, int], Array]()
-    for body in bodies:
-        for contact in body["contacts"]:
-            if contact["with_region"] != TABLE:
-                pair = (body["region_id"], contact["with_region"])
-                total = forces.setdefault(pair, np.zeros(3))
-                total += contact["force"]
-    for (one, other), force in forces.items():
-        back = forces.get((other, one), np.zeros(3))
-        if not np.allclose(force, -back, rtol=1e-9, atol=1e-9):
-            yield f"region {one} presses region {other} with another force than that region it"

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from services.read.independent import derive
+from services.read.independent.cameras import Subject, beside_transform, check_stands, orbits_of
 from services.read.independent.derive import (
     FIRST_OBJECT,
     ROUNDING,
@@ -21,6 +22,8 @@ from services.read.independent.derive import (
     StoredPair,
     distance,
     matrix,
+    name_of,
+    things_of,
     unproject,
 )
 from services.read.independent.targets import check_targets
@@ -44,7 +47,8 @@ def check_orbit(pair: StoredPair) -> Iterator[str]:
     else:
         # The point looked at, where it is nearest to the vertical line through the centre, or as near as the radius allows.
         nearest = -(T_in[:2, 3] @ axis[:2]) / max(float(axis[:2] @ axis[:2]), 1e-300)
-        target = (T_in[:3, 3] + np.clip(nearest, *np.broadcast_to(radius, 2)) * axis)[:2]
+        # The table's top has some height above the world's origin, a studio's object has its middle there.
+        target = (T_in[:3, 3] + np.clip(nearest, *np.broadcast_to(radius, 2)) * axis)[: 3 if pair.is_studio else 2]
         off = distance(target, np.clip(target, *orbit["aim_m"]))
     rolled = abs(math.degrees(math.atan2(-T_in[2, 0], -T_in[2, 1])))
     if off > ROUNDING or rolled > max(map(abs, orbit["roll_deg"])) + 1e-9:
@@ -66,7 +70,7 @@ def check_board(pair: StoredPair) -> Iterator[str]:
 
 
 def check_poses(pair: StoredPair) -> Iterator[str]:
-    """d_z, and from it and the input camera the aligned and the mirror camera."""
+    """d_z, and from it and the input camera the aligned and the mirror camera, and those that a job fixes to either."""
     cameras, T_in = pair.job["cameras"], matrix(pair.views["input"], "T_world_cam")
     d_z = _derive_d_z(pair)
     for role, view in pair.views.items():
@@ -82,9 +86,42 @@ def check_poses(pair: StoredPair) -> Iterator[str]:
     rolls = pair.is_captured or any(cameras["orbit"]["roll_deg"])
     other_side = _derive_rolled_mirror if rolls else _derive_mirror
     expected["mirror"] = expected["projected"] = other_side(T_in, d_z, MIRROR_FIT * d_z if T_z == "fit" else T_z)
+    fixed = {f"{name}_000": entry for name, entry in pair.named.items() if entry["beside"]}
+    expected |= {key: expected.get(entry["beside"], T_in) @ beside_transform(entry) for key, entry in fixed.items()}
     for role, T in expected.items():
         if role in pair.views and not (off := distance(matrix(pair.views[role], "T_world_cam"), T)) <= ROUNDING:
             yield f"T_world_cam of {role} is off by {off:.3g} from its definition"
+
+
+def check_named(pair: StoredPair) -> Iterator[str]:
+    """The cameras that a job names: how many a scene's first pair has, and where they stand, but for those of a table."""
+    is_first = pair.views["input"]["pose_id"] == 2 * pair.job["pairs_per_scene"] * pair.scene["scene_id"]
+    subject = None
+    for name, entry in pair.named.items():
+        views = sorted((view for view in pair.views.values() if view["role"] == name), key=lambda view: view["number"])
+        standing = is_first and not entry["beside"]
+        count = len(views) if entry["poses"] else sum(orbit["count"] for orbit in orbits_of(entry)) if standing else 0
+        count = 1 if entry["beside"] else count
+        if [view["number"] for view in views] != list(range(count)) or bool(views) != (standing or count == 1):
+            yield f"has {len(views)} views of camera {name}, and must have {count}, numbered from 0"
+        elif standing and not entry["poses"]:
+            try:
+                subject = subject or _subject(pair)
+            except FileNotFoundError as error:
+                pair.absent.append(str(error))
+                return
+            T = np.array([matrix(view, "T_world_cam") for view in views])
+            T_first = matrix(pair.views["input"], "T_world_cam")
+            yield from (f"camera {name} {fault}" for fault in check_stands(entry, T, subject, views[0], T_first))
+
+
+def _subject(pair: StoredPair) -> Subject:
+    """What named cameras are placed about. Raises FileNotFoundError without a shape's file."""
+    world = {region: (shape.points.reshape(-1, 3), T) for region, shape, T in things_of(pair)}
+    at = {region: points @ T[:3, :3].T + T[:3, 3] for region, (points, T) in world.items()}
+    objects = [region for region in world if region >= FIRST_OBJECT]
+    top_m = float(at[TABLE][:, 2].max()) if TABLE in at else 0.0
+    return Subject(np.concatenate([at[region] for region in objects]), top_m)
 
 
 def _derive_d_z(pair: StoredPair) -> float:
@@ -136,6 +173,8 @@ def list_underived(job: Mapping[str, Any]) -> list[str]:
         lines.append("projected images are not derived: images.projection.splat or hidden_point_removal is on")
     elif projection["enabled"] and sensor["distortion"]:
         lines.append("colours of projected images are not derived: sensor.distortion is on")
+    if tables := [entry["name"] for entry in job["cameras"]["more"] if entry["poses"]]:
+        lines.append(f"poses of {', '.join(tables)} are not derived: a table of poses has them")
     if sensor["depth_noise"]:
         lines.append("depth is not compared with the floor's plane: sensor.depth_noise is on")
     if views := job.get("targets", {}).get("views"):
@@ -155,8 +194,8 @@ def check_pair(pair: StoredPair) -> list[str]:
     cameras, projection = pair.job["cameras"], pair.job["images"]["projection"]
     switches = {**derive.beside(pair.job), "mirror": cameras["mirror"], "projected": projection}
     expected = {"input", *(role for role, branch in switches.items() if branch["enabled"])}
-    if set(pair.views) != expected:
-        return [f"scene {pair.scene['scene_id']}: has views {sorted(pair.views)}, and must have {sorted(expected)}"]
+    if (there := {name for name, view in pair.views.items() if view["role"] not in pair.named}) != expected:
+        return [f"scene {pair.scene['scene_id']}: has views {sorted(there)}, and must have {sorted(expected)}"]
     faults = [fault for view in pair.views.values() for fault in derive.check_images(pair, view)]
     if faults:
         return faults
@@ -168,13 +207,14 @@ def check_pair(pair: StoredPair) -> list[str]:
         elif _has_plain_points(pair.job):
             own += derive.check_projection(pair)
         faults += [f"pose {view['pose_id']} ({role}): {fault}" for fault in own]
-    own = [*check_poses(pair), *(check_board if pair.is_captured else check_orbit)(pair)]
+    own = [*check_poses(pair), *(check_board if pair.is_captured else check_orbit)(pair), *check_named(pair)]
     return faults + [f"pair {pair.views['input']['pose_id']}: {fault}" for fault in own]
 
 
 def check_merged(read: Callable[[str], bytes], views: Sequence[Row], objects: Sequence[Row]) -> Iterator[str]:
     """camPoses.csv and objects.dat (input and mirror cameras) and cameras.csv, line by line against rows of the tables."""
     poses, seen = ([row for row in rows if row["role"] in ("input", "mirror")] for rows in (views, objects))
+    views = [{**row, "role": name_of(row)} for row in views]
     labels = ("pose_id", "category", "instance_id", "region_id", "u", "v")
     for path, header, columns, key, rows in (
         ("camPoses.csv", ["id", "parent_id", *_ELEMENTS], ("pose_id", "parent_id"), ("pose_id",), poses),
@@ -190,10 +230,11 @@ def check_merged(read: Callable[[str], bytes], views: Sequence[Row], objects: Se
             yield f"{path}: cannot be read: {error}"
 
 
-def _rank(role: str) -> int:
-    """Where lines of this role come among those of one pose: cameras that the article does not have come last."""
+def _rank(name: str) -> tuple[int, str, int]:
+    """Where lines of views of this name come among those of one pose: cameras that the article does not have come last."""
     order = ("input", "aligned", "mirror", "projected")
-    return order.index(role) if role in order else len(order)
+    role, _, number = name.partition("_")
+    return (order.index(name), "", 0) if name in order else (len(order), role, int(number))
 
 
 def _check_lines(
@@ -213,3 +254,60 @@ def _check_lines(
         if wrong := [name for name, value in pairs if name not in named or type(value)(named[name]) != value]:
             at = ", ".join(f"{name} {row[name]}" for name in key)
             yield f"{', '.join(wrong)} in the line of {at} are not what the tables say"
+
+
+GRAVITY_M_S2 = 9.81
+
+SHARE = 0.01
+"""Of a weight, or of a weight at the lever of the farthest contact: what may be without balance."""
+
+
+def check_forces(job: Mapping[str, Any], scene: Row) -> Iterator[str]:
+    """What the forces of a scene's contacts do not explain, a sentence each."""
+    bodies = scene["bodies"]
+    falls = job.get("captures") is None and job.get("scene") != "studio"
+    if not bodies or not falls or not job["physics"]["exact_rest"]:
+        return
+    friction = job["physics"]["friction"] ** 2
+    for body in bodies:
+        for fault in _check_body(body, friction):
+            yield f"scene {scene['scene_id']}, region {body['region_id']}: {fault}"
+    yield from (f"scene {scene['scene_id']}: {fault}" for fault in _check_reactions(bodies))
+
+
+def _check_body(body: Row, friction: float) -> Iterator[str]:
+    contacts = body["contacts"]
+    if not contacts:
+        yield "nothing holds it"
+        return
+    force, normal, point = (np.array([contact[name] for contact in contacts]) for name in ("force", "normal", "point"))
+    weight, lever = body["mass_kg"] * GRAVITY_M_S2, point - np.array(body["com"])
+    left = np.linalg.norm(force.sum(axis=0) - [0.0, 0.0, weight]) / weight
+    turning = np.linalg.norm(np.cross(lever, force).sum(axis=0)) / (weight * np.linalg.norm(lever, axis=1).max())
+    if not left <= SHARE:
+        yield f"its contact forces leave {left:.1%} of its weight over"
+    if not turning <= SHARE:
+        yield f"its contact forces turn it, by {turning:.1%} of its weight at the lever of its farthest contact"
+    if not np.allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-9):
+        yield "a normal of a contact has not the length 1"
+    pressed = (force * normal).sum(axis=1)
+    slipping = np.linalg.norm(force - pressed[:, None] * normal, axis=1)
+    if (pressed < -ROUNDING * weight).any():
+        yield "a contact pulls"
+    if (slipping > friction * pressed + ROUNDING * weight).any():
+        yield f"a contact needs more than its friction of {friction:g}"
+
+
+def _check_reactions(bodies: list[Row]) -> Iterator[str]:
+    """Two bodies press one another with one force at one point."""
+    forces = dict[tuple[int, int], Array]()
+    for body in bodies:
+        for contact in body["contacts"]:
+            if contact["with_region"] != TABLE:
+                pair = (body["region_id"], contact["with_region"])
+                total = forces.setdefault(pair, np.zeros(3))
+                total += contact["force"]
+    for (one, other), force in forces.items():
+        back = forces.get((other, one), np.zeros(3))
+        if not np.allclose(force, -back, rtol=1e-9, atol=1e-9):
+            yield f"region {one} presses region {other} with another force than that region it"

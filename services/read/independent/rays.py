@@ -161,8 +161,8 @@ class Hits:
     """Faces at pixel centres, each [N], in order of pixel and z.
 
     pixel: flat number; face: number in `Faces`. z: metres, of the face's plane; low, high: within these it is right, with the
-    stored shape's rounding, and of a face near whose edge the centre lies, of what it has within `EDGE_PX`. covers: whether the
-    centre is within the face; sure: whether it is so by more than `EDGE_PX`.
+    stored shape's rounding, and of a face near whose edge the centre lies, of what it has within `EDGE_PX` and of its plane, as
+    renderers have it. covers: whether the centre is within the face; sure: whether it is so by more than `EDGE_PX`.
     """
 
     pixel: NDArray[np.int64]
@@ -189,11 +189,14 @@ def cast(faces: Faces, view: Row) -> Hits:
     z = np.maximum(faces.points[..., 2], NEAR_M)
     least, most = 1.0 / z.max(axis=1)[face], 1.0 / z.min(axis=1)[face]
     with np.errstate(invalid="ignore", over="ignore"):
-        inverse = np.clip(np.nan_to_num((planes[face] * at).sum(axis=1), nan=0.0), least, most)
+        plane = np.nan_to_num((planes[face] * at).sum(axis=1), nan=0.0)
+        inverse = np.clip(plane, least, most)
         reach = np.nan_to_num(np.hypot(*planes[face, :2].T) * EDGE_PX, nan=np.inf)
     sure = inside > EDGE_PX
     reach = np.where(sure, 0.0, reach)
-    low, high = 1.0 / np.clip(inverse + reach, least, most), 1.0 / np.clip(inverse - reach, least, most)
+    stored = np.where(sure | (plane <= 0.0), inverse, plane)
+    low = 1.0 / np.maximum(np.clip(inverse + reach, least, most), stored)
+    high = 1.0 / np.minimum(np.clip(inverse - reach, least, most), stored)
     normals, _ = faces.plane_normals
     rays = (at - [view["cx"], view["cy"], 0.0]) / [view["fx"], view["fy"], 1.0]
     slope = np.abs((normals[face] * rays).sum(axis=1))

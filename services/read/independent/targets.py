@@ -13,17 +13,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.read.independent.derive import FIRST_OBJECT, FLOOR, TABLE, Array, Kind, Row, StoredPair, matrix
+from services.read.independent.derive import (
+    FIRST_OBJECT,
+    FLOOR,
+    Array,
+    Kind,
+    Row,
+    StoredPair,
+    faces_of,
+    matrix,
+    name_of,
+)
 from services.read.independent.rays import (
     BEHIND_M,
     Faces,
     Hits,
-    bare_faces,
     cast,
     choices,
     on_edges,
-    place_shapes,
-    read_shape,
     seen_by,
 )
 
@@ -42,9 +49,6 @@ MOST_UNSURE = 12
 
 ENOUGH_WRONG = 40
 """After so many wrong pixels of an image, all others without the exact answer count as wrong."""
-
-FLOOR_M = 1e4
-"""Half the side of a floor, or of a capture's board, which are in no file: planes, whose colour is not judged."""
 
 
 @dataclass(frozen=True)
@@ -69,14 +73,15 @@ class Finding:
 
 def check_targets(pair: StoredPair, view: Row) -> Iterator[str]:
     """Images and columns of targets that differ from their definitions, a sentence each; none where a shape is in no file."""
-    if not pair.targets["views"]:
+    if pair.is_captured and not pair.targets["views"]:
         return
     try:
         faces = faces_of(pair, view)
     except FileNotFoundError as error:
         pair.absent.append(str(error))
         return
-    yield from _check_columns(pair, view, faces)
+    if pair.targets["views"]:
+        yield from _check_columns(pair, view, faces)
     for one in judge_images(pair, view, faces):
         pair.findings.append(one)
         if one.wrong:
@@ -84,49 +89,19 @@ def check_targets(pair: StoredPair, view: Row) -> Iterator[str]:
             yield f"{one.target}: {one.wrong} of {one.pixels} pixels are not what the shapes show: {at}"
 
 
-def faces_of(pair: StoredPair, view: Row) -> Faces:
-    """Floor, table and objects, or board and object, in the camera's frame. Raises FileNotFoundError without a shape's file.
-
-    Targets of a capture are of the stored corners, and not of those before rounding.
-    """
-    scene = pair.scene
-    T_cam_world = np.asarray(np.linalg.inv(matrix(view, "T_world_cam")), np.float64)
-    table = (TABLE, "table", scene["table_id"], matrix(scene, "T_world_table"))
-    plane, things = (TABLE, []) if pair.is_captured else (FLOOR, [table])
-    things += [
-        (body["region_id"], body["category"], body["instance_id"], matrix(body, "T_world_obj")) for body in pair.bodies
-    ]
-    placed: list[tuple[int, Faces, Array]] = [(plane, pair.shapes.get("floor") or _plane(), T_cam_world)]
-    for region, category, instance, T_world in things:
-        path = f"assets/{category}/{instance}.glb"
-        if path not in pair.shapes:
-            shape = read_shape(pair.read(path))
-            rounding_m = shape.rounding_m * (not pair.is_captured)
-            pair.shapes[path] = replace(shape, rounding_m=rounding_m)
-        placed.append((region, pair.shapes[path], T_cam_world @ T_world))
-    return place_shapes(placed)
-
-
-def _plane() -> Faces:
-    """A floor or a board, without a colour."""
-    corners = FLOOR_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-    points = corners[[[0, 1, 2], [0, 2, 3]]]
-    return replace(bare_faces(points), normals=np.broadcast_to([0.0, 0.0, 1.0], points.shape))
-
-
 def _check_columns(pair: StoredPair, view: Row, faces: Faces) -> Iterator[str]:
     """Extents and shares against their images, scale and offset of coordinates against the boxes of the shapes."""
-    rows = {row["region_id"]: row for row in pair.objects if row["role"] == view["role"]}
+    rows = pair.labels(view)
     asked, shapes = pair.targets["views"], {body["region_id"]: body for body in pair.bodies}
     for region, row in rows.items():
         expected: dict[str, object] = {"amodal_pixels": None, "amodal_bbox_xywh": None, "targets_share": None}
-        mask = pair.images.get((view["role"], f"amodal{region}"))
+        mask = pair.images.get((name_of(view), f"amodal{region}"))
         if mask is not None:
             expected |= {"amodal_pixels": np.count_nonzero(mask), "amodal_bbox_xywh": list(cv2.boundingRect(mask))}
-        own = pair.images[view["role"], "region"] == region
+        own = pair.images[name_of(view), "region"] == region
         for name in ("normals", "coordinates") if pair.is_captured and region >= FIRST_OBJECT and own.any() else ():
             if name in asked:
-                there = pair.images[view["role"], name][own].any(axis=1)
+                there = pair.images[name_of(view), name][own].any(axis=1)
                 expected["targets_share"] = np.count_nonzero(there) / len(there)
         for name, value in expected.items():
             if row[name] != value:
@@ -146,9 +121,9 @@ def _check_columns(pair: StoredPair, view: Row, faces: Faces) -> Iterator[str]:
 
 
 def judge_images(pair: StoredPair, view: Row, faces: Faces) -> list[Finding]:
-    """One finding for each target of a view that the job asks for; `faces` as `faces_of` has them."""
+    """A finding for each target of a view that the job asks for, and one of its depth and regions; `faces` as of `faces_of`."""
     hits, asked = cast(faces, view), pair.targets["views"]
-    region = pair.images[view["role"], "region"].reshape(-1)
+    region = pair.images[name_of(view), "region"].reshape(-1)
     own = hits.where(faces.region[hits.face] == region[hits.pixel])
     seen = (kind for kind in pair.kinds(view["role"]).values() if kind.formula is not None)
     findings = [_judge_seen(kind, pair, view, faces, own) for kind in seen]
@@ -159,6 +134,8 @@ def judge_images(pair: StoredPair, view: Row, faces: Faces) -> list[Finding]:
         findings += [_judge_amodal(pair, view, faces, objects, number) for number in pair.regions]
     if "layers" in asked:
         findings.append(_judge_layers(pair, view, faces, objects))
+    if not pair.is_captured:
+        findings.append(_judge_nearest(pair, view, faces, hits))
     return findings
 
 
@@ -197,8 +174,8 @@ def _settle(exact: _Exact, view: Row, faces: Faces, hits: Hits, fits: Callable[[
 
 def _judge_seen(kind: Kind, pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Finding:
     """A target of what is seen; `own`: hits of the thing that the mask shows."""
-    region = pair.images[view["role"], "region"].reshape(-1)
-    stored = pair.images[view["role"], kind.name].reshape(-1, kind.channels)
+    region = pair.images[name_of(view), "region"].reshape(-1)
+    stored = pair.images[name_of(view), kind.name].reshape(-1, kind.channels)
     assert kind.formula is not None
     least, unit, answer = _ANSWERS[kind.formula]
     shown = region >= least
@@ -274,7 +251,7 @@ def _coordinates(pair: StoredPair, view: Row, faces: Faces, hits: Hits, stored: 
     """The same as shares of the box's diagonal: coordinates_scale_m * value / 65535 + coordinates_offset_m is the point."""
     error = np.zeros(len(hits.z))
     region, rays = faces.region[hits.face], _rays(view, hits)
-    for row in (row for row in pair.objects if row["role"] == view["role"] and row["region_id"] >= FIRST_OBJECT):
+    for row in (row for number, row in pair.labels(view).items() if number >= FIRST_OBJECT):
         own = region == row["region_id"]
         T_obj_cam, some = np.linalg.inv(matrix(row, "T_cam_obj")), hits.where(own)
         points = rays[own] * _levels(some)
@@ -322,8 +299,8 @@ def _judge_covisible(pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Fi
 
     As many at edges of the mask as of objects elsewhere, evenly by number; not those near an edge in this view, see `seen_by`.
     """
-    mask, first, around = pair.images[view["role"], "covisible"], pair.views["input"], np.ones((3, 3), np.uint8)
-    shown = pair.images[view["role"], "region"] >= FIRST_OBJECT
+    mask, first, around = pair.images[name_of(view), "covisible"], pair.views["input"], np.ones((3, 3), np.uint8)
+    shown = pair.images[name_of(view), "region"] >= FIRST_OBJECT
     beside = shown & (cv2.dilate(mask * shown, around) != cv2.erode(np.where(shown, mask, 255), around))
     chosen = [np.flatnonzero(some) for some in (beside, shown & ~beside)]
     pixels = np.sort(np.concatenate([some[:: len(some) // COVISIBLE_PIXELS + 1] for some in chosen]))
@@ -341,7 +318,7 @@ def _judge_covisible(pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Fi
 
 def _judge_amodal(pair: StoredPair, view: Row, faces: Faces, objects: Hits, number: int) -> Finding:
     """255 where a ray meets the object, whatever is in front of it, and else 0."""
-    mask = pair.images[view["role"], f"amodal{number}"].reshape(-1)
+    mask = pair.images[name_of(view), f"amodal{number}"].reshape(-1)
     own = objects.where(faces.region[objects.face] == number)
     expected = np.zeros(len(mask), mask.dtype)
     expected[own.pixel[own.covers]] = 255
@@ -354,7 +331,8 @@ def _judge_layers(pair: StoredPair, view: Row, faces: Faces, objects: Hits) -> F
     """Depth and region of the first surfaces of objects along each ray, and of the last."""
     names = [*(f"layer{n}" for n in range(1, pair.targets["layers"] + 1)), "back"]
     depth, region = (
-        np.stack([pair.images[view["role"], f"{name}{what}"].reshape(-1) for name in names]) for what in ("", "_region")
+        np.stack([pair.images[name_of(view), f"{name}{what}"].reshape(-1) for name in names])
+        for what in ("", "_region")
     )
     covers = objects.where(objects.covers)
     start = np.searchsorted(covers.pixel, np.arange(depth.shape[1] + 1))
@@ -381,6 +359,28 @@ def _judge_layers(pair: StoredPair, view: Row, faces: Faces, objects: Hits) -> F
 
     exact = _Exact("layers", "mm", np.ones(depth.shape[1], bool), ~fits.all(axis=0), off.max(axis=0))
     return _settle(exact, view, faces, objects, fits_choice)
+
+
+def _judge_nearest(pair: StoredPair, view: Row, faces: Faces, hits: Hits) -> Finding:
+    """Region and depth of the nearest surface along each ray, whatever it is of. A floor beyond stored depth may have an end."""
+    region, depth = (pair.images[name_of(view), name].reshape(-1) for name in ("region", "depth"))
+    far_m, noisy = pair.job["images"]["depth_range_m"][1], bool(pair.job["sensor"]["depth_noise"])
+
+    def fits(pixel: int | NDArray, there: Hits) -> tuple[NDArray[np.bool_], Array]:
+        of, (right, off) = faces.region[there.face], _fits_depth(pair, view, depth[pixel], there.low, there.high)
+        ends = (of == FLOOR) & (there.high > far_m) & (region[pixel] == 0) & (depth[pixel] == 0)
+        return ((of == region[pixel]) & (right | noisy)) | ends, np.zeros(len(off)) if noisy else off
+
+    def fits_choice(pixel: int, there: Hits) -> bool:
+        first = there.where(there.low <= there.high.min(initial=np.inf))
+        return bool(fits(pixel, first)[0].any()) if len(first.z) else not region[pixel]
+
+    covers = hits.where(hits.covers)
+    nearest = covers.where(np.unique(covers.pixel, return_index=True)[1])
+    right, off = (region == 0) & (depth == 0), np.zeros(len(region))
+    right[nearest.pixel], off[nearest.pixel] = fits(nearest.pixel, nearest)
+    exact = _Exact("depth and region", "mm", np.ones(len(region), bool), ~right, off)
+    return _settle(exact, view, faces, hits, fits_choice)
 
 
 def _fits_depth(

@@ -34,6 +34,7 @@ from workers.store.local import LocalStore
 
 SPLITS = ("train", "val", "test")
 OF = dict.fromkeys(("occnet", "nocs"), ("shaped", "shaped_tars"))
+OF |= dict.fromkeys(("zero123", "instantmesh", "trellis", "stereo"), ("studio", "studio_tars"))
 """Datasets that formats which need targets are tested on."""
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -1,8 +1,10 @@
 """The second derivation: healthy datasets pass; a wrong formula of the producer passes plain verify, and not this one."""
 
 import copy
+import dataclasses
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,16 +20,51 @@ import workers.scene.pairs as pairs
 from schemas.dataset.shard import Fingerprint
 from schemas.scene.view import Camera, Intrinsics
 from services.read.audit import describe_independent, verify_independently
-from services.read.independent.derive import check_forces
+from services.read.independent.poses import check_forces
 from tests.captures import CAMERA, captures_job, exact_capture, use_exact_captures
-from tests.datasets import faults_of, make_dataset, run_here
+from tests.datasets import faults_of, make_dataset, overlaid, run_here
 from workers.capture import make_capture, rows
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.render.raster.gbuffer import shared_renderer
 from workers.shard.fingerprint import take_fingerprint
 from workers.targets.targets import draw_targets
 
+NAMED: list[dict[str, Any]] = [
+    {"name": "left", "beside": "input", "offset_m": [-0.06, 0.01, 0.02], "rotation_deg": [3.0, -8.0, 5.0]},
+    {
+        "name": "around",
+        "ring": {"count": 3, "inclination_rad": [0.3, 0.6], "start_rad": 0.4, "start": "input", "radius_m": [0.8, 1.2]},
+        "roll_deg": [-20, 30],
+    },
+    {
+        "name": "hammersley",
+        "sphere": {"count": 3, "inclination_rad": [0.4, 1.2]},
+        "sensor": {"width": 90, "height": 120, "fx": 100, "fy": 140, "cx": 50, "cy": 66},
+    },
+    {"name": "spiral", "sphere": {"count": 3, "pattern": "fibonacci", "inclination_rad": [0.3, 1.5]}, "fov_deg": 40},
+    {
+        "name": "over",
+        "sphere": {"count": 2, "pattern": "uniform", "inclination_rad": [0.3, 1.5], "radius_m": [1.0, 2.0]},
+        "about": "table",
+    },
+]
+"""An entry of each kind, with every key that says where a camera stands."""
+
+ALONE: dict[str, Any] = {
+    "scene": "studio",
+    "studio": {"scale": "unit_cube"},
+    "cameras": {
+        "more": [
+            {"name": "trellis", "sphere": {"count": 5, "pattern": "trellis"}},
+            *({"name": name, "preset": name} for name in ("zero123", "syncdreamer", "zero123plus", "lrm")),
+        ]
+    },
+}
+
 HEALTHY = {
+    "named": {"cameras": {"more": NAMED}, "pairs_per_scene": 2, "objects_per_scene": 2},
+    "studio": {**ALONE, "scenes": 1, "targets": {"views": ["normals"]}},
+    "distances": {"cameras": {"orbit": {"radius_m": [2.0, 2.8]}}},
     "defaults": {},
     "several": {
         "objects_per_scene": 3,
@@ -48,7 +85,8 @@ def test_a_healthy_dataset_has_no_faults(tmp_path, name):
     store, _ = make_dataset(tmp_path, **HEALTHY[name])
     found = verify_independently(store, 9, lambda _: None)
     assert found.faults == []
-    assert (found.scenes, found.pairs) == (2, 2 * HEALTHY[name].get("pairs_per_scene", 1))
+    scenes = HEALTHY[name].get("scenes", 2)
+    assert (found.scenes, found.pairs) == (scenes, scenes * HEALTHY[name].get("pairs_per_scene", 1))
     assert "nothing off" in "\n".join(describe_independent(found))
 
 
@@ -160,7 +198,7 @@ WRONG = {
     "orbit": (
         camera.orbit_pose,
         lambda f: lambda centre, inclination, yaw, radius: f(centre, inclination, yaw, 0.99 * radius),
-        "does not look at the table's centre from cameras.orbit.radius_m",
+        "does not look at the table's centre",
     ),
     "yaw": (camera.yaw, lambda f: lambda T: -f(T), "is not the direction from the table to the camera"),
     "half a pixel in rendering": (
@@ -197,6 +235,135 @@ def test_a_wrong_formula_passes_plain_verify_and_not_the_second_derivation(tmp_p
     store, _ = make_dataset(tmp_path, scenes=3)
     assert faults_of(store) == []
     faults = verify_independently(store, 3, lambda _: None).faults
+    assert any(told in fault for fault in faults), faults
+
+
+def only_named(f: Callable, **changes: Callable) -> Callable:
+    """`render_view` whose images are those of a changed camera in views of named cameras."""
+
+    def planted(scene, role, pair, camera, *rest):
+        view = f(scene, role, pair, camera, *rest)
+        if not rest[1:]:
+            return view
+        drawn = f(scene, role, pair, shifted(camera, 0.5), *rest)
+        return dataclasses.replace(view, **{name: change(drawn, view) for name, change in changes.items()})
+
+    return planted
+
+
+def no_alpha_inside(rgb, region, alpha):
+    return np.dstack([rgb, np.where(alpha == 255, 0, alpha)])
+
+
+WRONG_NAMED: dict[str, tuple[object, str, Callable[[Any], object], dict[str, Any], str]] = {
+    "beside": (
+        cameras,
+        "rotation_about",
+        lambda f: lambda axis, angle: f(axis, -angle),
+        {},
+        "T_world_cam of left_000 is off",
+    ),
+    "step": (cameras, "_towards", lambda f: lambda around, z: f(1.02 * around, z), {}, "pattern ring: its direction"),
+    "start": (cameras, "yaw", lambda f: lambda T: -f(T), {}, "camera around does not begin at start_rad"),
+    "golden": (cameras, "GOLDEN", lambda value: 1.001 * value, {}, "pattern fibonacci: its direction"),
+    "digits": (cameras, "_radical_inverse", lambda f: lambda n: n / 3.0, {}, "pattern hammersley: its direction"),
+    "height": (
+        cameras,
+        "_towards",
+        lambda f: lambda around, z: f(around, z**3),
+        ALONE,
+        "pattern trellis: its height is off",
+    ),
+    "band": (
+        cameras,
+        "_at_random",
+        lambda f: lambda rng, *rest: f(rng, 0.0, 0.1, rest[-1]),
+        {},
+        "outside inclination_rad",
+    ),
+    "aim": (
+        cameras,
+        "look_at",
+        lambda f: lambda position, target: f(position, target + 1e-4),
+        {},
+        "camera over does not look at table",
+    ),
+    "about": (
+        cameras._Placed,
+        "point",
+        lambda f: lambda placed, about: f(placed, "object" if about == "table" else about),
+        {},
+        "camera over does not look at table",
+    ),
+    "range": (
+        cameras,
+        "_draw_distance",
+        lambda f: lambda *given: 1.3 * f(*given),
+        {},
+        "camera around stands",
+    ),
+    "fit": (
+        cameras._Placed,
+        "fit_m",
+        lambda f: lambda placed, share, k: f(placed, share, k.model_copy(update={"fx": k.fy})),
+        {},
+        "camera hammersley stands",
+    ),
+    "roll": (
+        cameras,
+        "_draw",
+        lambda f: lambda rng, ends: f(rng, ends) - 40.0 * (ends.high == 30.0),
+        {},
+        "outside roll_deg",
+    ),
+    "lens": (
+        cameras,
+        "intrinsics_of",
+        lambda f: lambda entry, sensor: f(entry.model_copy(update={"sensor": None}), sensor),
+        {},
+        "(hammersley_000): width is 160, the job gives 90",
+    ),
+    "unit": (
+        cameras,
+        "VIEW_PRESETS",
+        lambda presets: {name: preset._replace(of="side", unit_m=1.0) for name, preset in presets.items()},
+        ALONE,
+        "camera zero123plus stands",
+    ),
+    "number": (
+        pairs,
+        "place_fixed",
+        lambda f: lambda *given: (dataclasses.replace(each, number=1) for each in f(*given)),
+        {},
+        "has 1 views of camera left, and must have 1, numbered from 0",
+    ),
+    "drawn": (
+        pairs,
+        "render_view",
+        lambda f: only_named(f, region=lambda drawn, view: drawn.region, depth=lambda drawn, view: drawn.depth),
+        {},
+        "depth and region:",
+    ),
+    "target": (
+        pairs,
+        "render_view",
+        lambda f: only_named(f, further=lambda drawn, view: drawn.further),
+        {"targets": {"views": ["normals"]}},
+        "normals:",
+    ),
+    "alpha": (pairs, "with_alpha", lambda _: no_alpha_inside, ALONE, "alpha is 0 where the mask shows something"),
+    "names": (tables, "view_name", lambda f: lambda role, number: f(role, number and 2 - number), {}, "cameras.csv:"),
+}
+"""(where it is, its name, the wrong one made of it, the job, what is told) for each thing that is derived of named cameras."""
+
+
+@pytest.mark.parametrize("name", WRONG_NAMED)
+def test_a_named_camera_that_stands_or_shows_another_thing_is_found(tmp_path, monkeypatch, plant, name):
+    owner, attribute, wrong, job, told = WRONG_NAMED[name]
+    monkeypatch.setattr(owner, attribute, wrong(getattr(owner, attribute)))
+    job = overlaid({"scenes": 1} | ({} if job is ALONE else {"cameras": {"more": NAMED}}), job)
+    store, _ = make_dataset(tmp_path, **job)
+    faults = verify_independently(store, 1, lambda _: None).faults
     assert any(told in fault for fault in faults), faults
 
 

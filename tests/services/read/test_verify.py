@@ -99,9 +99,16 @@ def vouched_rows(out: Path) -> None:
 
 
 def vouched_bytes(out: Path) -> None:
-    """A merged table with the same rows as another version of pyarrow writes them."""
-    pq.write_table(pq.read_table(out / VIEWS, partitioning=None), out / VIEWS, compression="gzip")
+    """The same rows as another version of pyarrow wrote them, or of ours: without a column, of values that are never missing."""
+    views = pq.read_table(out / VIEWS, partitioning=None).drop_columns("number")
+    scenes = pq.read_table(path := next(out.glob("manifest/scenes/*/*")), partitioning=None)
+    at = scenes.schema.get_field_index("bodies")
+    body = [field.with_nullable(field.name.startswith("recheck")) for field in scenes.schema.types[at].value_type]
+    solid = scenes.schema.set(at, pa.field("bodies", pa.list_(pa.struct(body))))
+    pq.write_table(views, out / VIEWS, compression="gzip")
+    pq.write_table(scenes.cast(solid), path)
     vouch(out, VIEWS)
+    vouch(out, path.relative_to(out).as_posix())
 
 
 def other_stack(out: Path) -> None:

@@ -22,7 +22,7 @@ from workers.assets.library.reading import (
     describe_refusal,
     refusal_of,
 )
-from workers.assets.library.table import Library, Row, write_whole
+from workers.assets.library.table import PLAIN, Library, Row, write_whole
 from workers.door.meshes.mesh import transform_shape
 from workers.geometry.frames import pose
 from workers.pool import Answers
@@ -176,7 +176,7 @@ def with_shape(library: Library, row: Row, made: bytes | MeshError) -> Row:
         faces=kept["faces"],
         watertight=kept["watertight"],
         pictures=kept["pictures"],
-        mended=tuple(kept["notes"]),
+        mended=(*kept["notes"], *(note for note in row.mended if note == PLAIN)),
         scale=kept["scale"],
         mass_kg=kept["mass"][0],
         volume_m3=kept["mass"][0] / USUAL_DENSITY if kept["mass"][3] else None,
