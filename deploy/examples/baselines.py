@@ -15,6 +15,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import chain, product
 from pathlib import Path
 from typing import Any, Final
@@ -134,13 +135,14 @@ def inside(points: NDArray, mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
     return np.abs(winding_numbers(points.astype(np.float64), shape)) > 0.5
 
 
-def train_depth(dataset: Dataset) -> Predictor:
-    """The U-Net of train_mirror_depth.py."""
+def train_depth(dataset: Dataset, noise: bool = False) -> Predictor:
+    """The U-Net of train_mirror_depth.py; noise: it learns from each pair twice, as stored and with level 3's input view."""
     import train_mirror_depth as depth
 
     fix_numbers()
     net = depth.Net()
-    depth.train(net, depth.load(dataset.place), depth.EPOCHS)
+    senses = [partial(sense_input, job=dataset.job)] if noise else []
+    depth.train(net, depth.load(dataset.place, *senses), depth.EPOCHS)
     return depth.predictor(net)
 
 
@@ -180,11 +182,12 @@ BASELINES: Final[Mapping[str, Callable[[Dataset], Predictor]]] = {
     "symmetry": lambda dataset: guesses.complete_by_symmetry,
     "nearest training shape": find_shapes,
     "mirror-depth network": train_depth,
+    "mirror-depth network with noise": partial(train_depth, noise=True),
     "occupancy network": train_volume,
 }
 """What makes a predictor of a dataset, by name."""
 
-NETWORKS: Final = ("mirror-depth network", "occupancy network")
+NETWORKS: Final = ("mirror-depth network", "mirror-depth network with noise", "occupancy network")
 """Those that PyTorch trains."""
 
 

@@ -35,18 +35,18 @@ class MirrorDepthPairs(TorchDataset):
     """Pairs of one split by instance; an item is a dict of tensors [..., H, W] as `mirror_depth.Example` tells them.
 
     The ids are looked up once; images are read and decoded when an item is asked for, so that worker processes of a
-    DataLoader share nothing.
+    DataLoader share nothing. sense: what lies between a stored pair and the network, such as noise.
     """
 
-    def __init__(self, place: str, split: Split) -> None:
-        self._pairs = open_dataset(place)
+    def __init__(self, place: str, split: Split, sense: Callable[[Pair], Pair] = lambda pair: pair) -> None:
+        self._pairs, self._sense = open_dataset(place), sense
         self.ids = [pair.pose_id for pair in pairs_of_split(self._pairs, split)]
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        example = make_example(self._pairs.pair(self.ids[index]))
+        example = make_example(self._sense(self._pairs.pair(self.ids[index])))
         if example is None:  # too near the rim: the next one stands in
             return self[(index + 1) % len(self)]
         known = (example.depth > 0)[None]
@@ -106,10 +106,10 @@ def loss_of(net: Net, batch: dict[str, Tensor]) -> Tensor:
     return functional.binary_cross_entropy_with_logits(logit, batch["mask"].float()) + error[mask].mean()
 
 
-def load(place: str) -> dict[str, Tensor]:
-    """All training pairs in memory: some hundred are small."""
-    pairs = MirrorDepthPairs(place, "train")
-    return stack([pairs[number] for number in range(len(pairs))])
+def load(place: str, *senses: Callable[[Pair], Pair]) -> dict[str, Tensor]:
+    """All training pairs in memory, as stored and by each sense: some thousand are small."""
+    splits = [MirrorDepthPairs(place, "train"), *(MirrorDepthPairs(place, "train", sense) for sense in senses)]
+    return stack([pairs[number] for pairs in splits for number in range(len(pairs))])
 
 
 def stack(items: list[dict[str, Tensor]]) -> dict[str, Tensor]:

@@ -27,7 +27,9 @@ pytestmark = pytest.mark.skipif(
 
 CHECKS = """
 import sys
+from functools import partial
 import torch
+from baselines import sense_input
 from mirror_depth import make_example, pairs_of_split
 from train_mirror_depth import MirrorDepthPairs, Net, complete, load, loss_of
 from services.dataset.dataset import open_dataset
@@ -42,6 +44,9 @@ assert torch.equal(batch["depth"][0], train[0]["depth"])
 
 torch.manual_seed(0)
 data, net = load(place), Net(8)
+twice = load(place, partial(sense_input, job=open_dataset(place).job))["features"]
+assert torch.equal(twice[: len(train)], data["features"]) and len(twice) == 2 * len(train)
+assert not torch.equal(twice[len(train) :], data["features"])
 optimiser = torch.optim.Adam(net.parameters(), 1e-2)
 losses = []
 for _ in range(40):
