@@ -62,6 +62,15 @@ Folder = Annotated[str, Field(max_length=4000), AfterValidator(_plain)]
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
+VALUE_KINDS = ("[word]", "[list]", "[number]")
+"""Marks of the kinds of value that a key may have, of which an error is told of the right one."""
+
+
+def value_kind(value: object) -> str:
+    """The mark of a value's kind."""
+    return "[word]" if isinstance(value, str) else "[list]" if isinstance(value, list | tuple) else "[number]"
+
+
 Share = Annotated[float, Field(ge=0, le=1)]
 PositiveInt = Annotated[int, Field(ge=1)]
 NonNegativeInt = Annotated[int, Field(ge=0)]

@@ -195,6 +195,7 @@ class LibrarySource(Frozen):
 
 
 Source = Annotated[ProceduralSource | LibrarySource, Field(discriminator="source")]
+SOURCE_KINDS = ("procedural", "library")
 
 
 Split = Literal["train", "val", "test", "unseen"]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
 
-from schemas.base import Folder, Frozen, Interval, Range, ordered
+from schemas.base import Folder, Frozen, Interval, Range, ordered, value_kind
 
 FocalLength = Annotated[float, Field(ge=1e-3, le=1e6)]
 PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -26,33 +26,35 @@ def _read_share(text: str) -> str:
     return text
 
 
-def _kind(value: object) -> str:
-    return "[fit]" if isinstance(value, str) else "[range]" if isinstance(value, list | tuple) else "[metres]"
-
-
 ReachRange = Annotated[tuple[Reach, Reach], AfterValidator(lambda ends: ordered(Range(*ends)))]
 Framed = Annotated[
-    Annotated[Reach, Tag("[metres]")]
-    | Annotated[ReachRange, Tag("[range]")]
-    | Annotated[str, AfterValidator(_read_share), Tag("[fit]")],
-    Discriminator(_kind),
+    Annotated[Reach, Tag("[number]")]
+    | Annotated[ReachRange, Tag("[list]")]
+    | Annotated[str, AfterValidator(_read_share), Tag("[word]")],
+    Discriminator(value_kind),
 ]
 """A distance: metres, [least, most] to draw from, `fit`, or a share of the picture."""
 Behind = Annotated[
-    Annotated[Reach, Tag("[metres]")] | Annotated[ReachRange, Tag("[range]")] | Annotated[Literal["fit"], Tag("[fit]")],
-    Discriminator(_kind),
+    Annotated[Reach, Tag("[number]")] | Annotated[ReachRange, Tag("[list]")] | Annotated[Literal["fit"], Tag("[word]")],
+    Discriminator(value_kind),
 ]
+
+
+def _number_kind(value: object) -> str:
+    return "[list]" if isinstance(value, list | tuple) else "[number]"
+
+
 Focal = Annotated[
-    Annotated[FocalLength, Tag("[pixels]")]
-    | Annotated[tuple[FocalLength, FocalLength], AfterValidator(lambda ends: ordered(Range(*ends))), Tag("[range]")],
-    Discriminator(lambda value: "[range]" if isinstance(value, list | tuple) else "[pixels]"),
+    Annotated[FocalLength, Tag("[number]")]
+    | Annotated[tuple[FocalLength, FocalLength], AfterValidator(lambda ends: ordered(Range(*ends))), Tag("[list]")],
+    Discriminator(_number_kind),
 ]
 Principal = Annotated[
-    Annotated[PrincipalPoint, Tag("[pixels]")]
+    Annotated[PrincipalPoint, Tag("[number]")]
     | Annotated[
-        tuple[PrincipalPoint, PrincipalPoint], AfterValidator(lambda ends: ordered(Range(*ends))), Tag("[range]")
+        tuple[PrincipalPoint, PrincipalPoint], AfterValidator(lambda ends: ordered(Range(*ends))), Tag("[list]")
     ],
-    Discriminator(lambda value: "[range]" if isinstance(value, list | tuple) else "[pixels]"),
+    Discriminator(_number_kind),
 ]
 """A number, or [least, most] to draw from for each input camera."""
 
@@ -233,6 +235,10 @@ def _named(name: str) -> str:
 
 
 Point = tuple[Offset, Offset, Offset]
+About = Annotated[
+    Annotated[Literal["object", "table", "world"], Tag("[word]")] | Annotated[Point, Tag("[list]")],
+    Discriminator(lambda value: "[list]" if isinstance(value, list | tuple) else "[word]"),
+]
 Angle = Annotated[float, Field(ge=-360, le=360)]
 FieldOfView = Annotated[float, Field(ge=0.1, le=175)]
 KINDS = ("beside", "ring", "sphere", "poses", "preset")
@@ -258,7 +264,7 @@ class More(Frozen):
     """A table (.csv, .parquet or .json) of poses, a row a view."""
     preset: Literal["zero123", "syncdreamer", "zero123plus", "lrm", "trellis"] | None = None
     """Cameras as a published method has them (docs/studio.md)."""
-    about: Literal["object", "table", "world"] | Point = "object"
+    about: About = "object"
     """The point looked at: the middle of the objects, of the table top, the world's origin, or a point of the world."""
     roll_deg: OneOrRange = Range(0.0, 0.0)
     """Turn of each camera about its optical axis."""
@@ -280,6 +286,11 @@ class More(Frozen):
         if len(there) != 1:
             raise ValueError(
                 f"camera {self.name} has {' and '.join(there) or 'none'} of {', '.join(KINDS)}: give one of them"
+            )
+        aimed = {"about": self.about != "object", "roll_deg": self.roll_deg != Range(0.0, 0.0)}
+        if there[0] in ("beside", "poses") and (idle := [key for key, is_set in aimed.items() if is_set]):
+            raise ValueError(
+                f"camera {self.name}: {there[0]} says where it looks, and {idle[0]} cannot act: leave {idle[0]} out"
             )
         if self.beside is None and (self.offset_m, self.rotation_deg) != ((0.0,) * 3, (0.0,) * 3):
             raise ValueError(f"camera {self.name}: offset_m and rotation_deg are for beside, and it has {there[0]}")
@@ -385,5 +396,6 @@ class Cameras(Frozen):
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"more names {', '.join(twice)} twice: each camera needs a name of its own")
         if not self.mirror.enabled and (lost := [entry.name for entry in self.more if entry.beside == "mirror"]):
-            raise ValueError(f"camera {lost[0]} stands beside the mirror camera, and mirror.enabled is false")
+            remedy = "set mirror.enabled: true, or beside: input"
+            raise ValueError(f"camera {lost[0]} stands beside the mirror camera, and mirror.enabled is false: {remedy}")
         return self

@@ -313,6 +313,8 @@ def _unfit_for_scene(job: Job) -> str | None:
         return "scene is studio, and start.arrange is pile: leave it out"
     if job.studio.background == "transparent" and job.sensor.changes_rgb:
         return "sensor asks for an effect on RGB, which alpha cannot follow: set studio.background to a colour, such as [1, 1, 1]"
+    if lost := [entry.name for entry in job.cameras.more if entry.about == "table"]:
+        return f"scene is studio, and camera {lost[0]} looks at the table, of which there is none: set about to object or world"
     if job.render.tier == "pathtraced":
         return "scene is studio, and render.tier is pathtraced: use raster or flat"
     return None

@@ -5,7 +5,7 @@ Targets are what networks are trained on beside the images of the article, by vi
 
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Discriminator, Field, Tag, field_validator, model_validator
 
 from schemas.base import Frozen, Interval, NonNegative, Positive, PositiveInt, Range, Share
 
@@ -83,6 +83,12 @@ class Render(Frozen):
     """Most scatterings and glass crossings of a path, for tier pathtraced."""
 
 
+Background = Annotated[
+    Annotated[Literal["transparent"], Tag("[word]")] | Annotated[tuple[Share, Share, Share], Tag("[list]")],
+    Discriminator(lambda value: "[list]" if isinstance(value, list | tuple) else "[word]"),
+]
+
+
 class Studio(Frozen):
     """How an object stands for itself, with `scene: studio`: on nothing, so that there is no table, fall, floor or shadow."""
 
@@ -92,7 +98,7 @@ class Studio(Frozen):
     """Of `unit_sphere` and `unit_cube`."""
     light: Literal["even", "three_point", "environment"] = "even"
     """even: from everywhere, no highlights; three_point: key, fill and rim; environment: a bright sky over a ground."""
-    background: Literal["transparent"] | tuple[Share, Share, Share] = "transparent"
+    background: Background = "transparent"
     """transparent: RGB has alpha, the share of each pixel that the object covers; or one sRGB colour, [1, 1, 1] for white."""
 
 

@@ -10,9 +10,10 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from schemas.base import set_key
+from schemas.base import VALUE_KINDS, set_key
 from schemas.dataset.layout import SWITCHES, is_stored
 from schemas.errors import JobError, did_you_mean, plain_line
+from schemas.job.assets import SOURCE_KINDS
 from schemas.job.job import Job
 from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
 from services.job.packed import is_packed, pack, unpack
@@ -111,9 +112,9 @@ def _one_of(given: object, allowed: str) -> str:
 
 
 def _written(place: Sequence[str | int]) -> list[str | int]:
-    """The parts of a place that the job file has: not the kind that follows a source's position, nor a mark in brackets."""
-    parts = [part for before, part in zip((None, *place), place, strict=False) if not isinstance(before, int)]
-    return parts[:-1] if str(parts[-1:]).startswith("['[") else parts
+    """The parts of a place that the job file has: neither the kind that follows a source's position, nor that of a value."""
+    kinds = [(before, part) for before, part in zip((None, *place), place, strict=False) if part not in VALUE_KINDS]
+    return [part for before, part in kinds if not (isinstance(before, int) and part in SOURCE_KINDS)]
 
 
 def load_job(path: Path, changes: Sequence[str] = ()) -> Job:
@@ -270,6 +271,7 @@ NEEDS: dict[str, tuple[tuple[str, Acts], ...]] = {
     "start.arrange": (_SEVERAL,),
     "start.pile_offset_m": (_SEVERAL, _PILE),
     "physics.concavity": (_PARTS,),
+    "studio.size_m": (("studio.scale is metric", lambda job: job.studio.scale != "metric"),),
 }
 """Keys of scenes by what must hold for them to act: a phrase for where it does not, and whether it does."""
 

@@ -33,7 +33,7 @@ from workers.physics.hold import release_again
 from workers.physics.settle import settle_scene
 from workers.render.raster.gbuffer import Renderer
 from workers.scene.context import WorkerContext
-from workers.scene.effects import EFFECTS, Facts, names_of_kind, plan_effects
+from workers.scene.effects import EFFECTS, STUDIO, Facts, names_of_kind, plan_effects
 from workers.scene.make_scene import Scene, make_scene
 from workers.scene.rows import record_scene
 from workers.stopwatch import Stopwatch
@@ -305,7 +305,8 @@ def _audit_scene(context: WorkerContext, store: Store, scene_id: int, audited: A
     stored = find_scene(store, scene_id)
     row = stored.scene(scene_id)
     assert row is not None
-    left_out = sorted({one["effect"] for one in row["skipped"]} & audited.effects.keys())
+    forcible = {one["effect"] for one in row["skipped"] if not one["why"].startswith(STUDIO)}
+    left_out = sorted(forcible & audited.effects.keys())
     for name in left_out:
         audited.effects[name].skipped += 1
     audited.scenes += 1

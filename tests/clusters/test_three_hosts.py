@@ -232,3 +232,14 @@ def test_a_worker_host_killed_and_one_cut_off_under_way_change_no_byte(cluster, 
 
 def test_a_killed_head_that_is_brought_back_and_asked_again_makes_the_same_dataset(cluster, packed, local):
     assert digest_in(lose_the_head(cluster, packed, cluster.storage / "headless")) == local
+
+
+def test_rings_in_a_studio_are_the_same_where_hosts_are_lost_and_where_a_job_is_extended(cluster, folder):
+    more = [{"name": "around", "ring": {"count": 3, "radius_m": [1.0, 2.0]}}, {"name": "side", "beside": "input"}]
+    tree = {**SMALL, "scene": "studio", "cameras": {**SMALL["cameras"], "more": more}, "run": {"range_size": 2}}
+    file = folder / "studio.yaml"
+    for scenes in (20, 48):
+        file.write_text(json.dumps({**tree, "scenes": scenes}))
+        extended = run_here(file, folder / "extended")
+    packed = here("pack", str(file)).strip()
+    assert digest_in(lose_two_hosts(cluster, packed, cluster.storage / "studio")) == extended

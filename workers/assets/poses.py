@@ -28,6 +28,19 @@ ELEMENTS = tuple(f"T{row}{column}" for row in range(4) for column in range(4))
 FRAMES = ("T_world_cam", "T_obj_cam")
 PINHOLE = tuple(Intrinsics.model_fields)
 
+BOUNDS: Mapping[str, tuple[float, float, bool]] = {
+    **dict.fromkeys(("width", "height"), (1, 4096, True)),
+    **dict.fromkeys(("fx", "fy"), (1e-3, 1e6, False)),
+    **dict.fromkeys(("cx", "cy"), (-1e6, 1e6, False)),
+}
+"""Least, most, and whether whole, of each column of a pinhole: as of the job's sensor."""
+
+MOST_M = 1e3
+"""Farthest that a camera may be from its frame's origin, along an axis."""
+
+BLOCK = 1 << 16
+"""Rows that are judged at once."""
+
 TOLERANCE = 1e-4
 """How far a product R^T R may be from the identity: files of few digits are usual. What is used is the nearest rotation."""
 
@@ -75,6 +88,8 @@ def open_poses(job: Job, folder: Path) -> Mapping[str, PoseFile]:
             continue
         path = (folder / Path(entry.poses).expanduser()).resolve()
         try:
+            if path.exists() and not path.is_file():
+                raise ValueError("is no file")
             with open(path, "rb") as file:
                 opened[entry.name] = PoseFile(path, hashlib.file_digest(file, "sha256").hexdigest())
             _require_scenes(read_poses(opened[entry.name]), job)
@@ -82,7 +97,7 @@ def open_poses(job: Job, folder: Path) -> Mapping[str, PoseFile]:
             raise AssetSourceError(
                 f"cameras.more.{number}.poses: {path} cannot be read: {error.strerror or error}"
             ) from error
-        except (ValueError, KeyError, pa.ArrowException) as error:
+        except (ValueError, KeyError, RecursionError, pa.ArrowException) as error:
             raise AssetSourceError(f"cameras.more.{number}.poses: {path}: {plain_line(str(error), 300)}") from error
     return opened
 
@@ -107,11 +122,15 @@ def _require_scenes(poses: Poses, job: Job) -> None:
 def read_poses(file: PoseFile) -> Poses:
     """The rows of a table. Raises ValueError where they are none, OSError where it cannot be read."""
     table = _read_table(file.path)
-    names = set(table.column_names)
-    frame = next((name for name in FRAMES if name in names), None)
-    if frame is not None:
-        T = _matrices(table.column(frame))
-    elif names.issuperset(ELEMENTS):
+    names = table.column_names
+    if not len(table):
+        raise ValueError("has no rows")
+    frames = [name for name in FRAMES if name in names]
+    if len(frames) > 1:
+        raise ValueError(f"has the columns {' and '.join(frames)}: give one of them")
+    if frames:
+        T = _matrices(table.column(frames[0]), frames[0])
+    elif set(names).issuperset(ELEMENTS):
         T = np.stack([_numbers(table, name) for name in ELEMENTS], axis=1).reshape(-1, 4, 4)
     else:
         raise ValueError(
@@ -120,11 +139,11 @@ def read_poses(file: PoseFile) -> Poses:
     there = [name for name in PINHOLE if name in names]
     if there and len(there) < len(PINHOLE):
         raise ValueError(f"has the columns {', '.join(there)}: give all of {', '.join(PINHOLE)}, or none")
-    pinholes = np.stack([_numbers(table, name) for name in PINHOLE], axis=1) if there else None
-    if pinholes is not None and (wrong := np.flatnonzero((pinholes[:, :4] <= 0.0).any(axis=1))).size:
-        raise ValueError(f"row {wrong[0]}: width, height, fx and fy must be above 0")
-    scene_ids = _numbers(table, "scene_id").astype(np.int64) if "scene_id" in names else None
-    return Poses(_rigid(T), frame == "T_obj_cam", scene_ids, pinholes)
+    pinholes = np.stack([_numbers(table, name, *BOUNDS[name]) for name in PINHOLE], axis=1) if there else None
+    scene_ids = _numbers(table, "scene_id", 0, 2**53, True).astype(np.int64) if "scene_id" in names else None
+    for start in range(0, len(T), BLOCK):
+        T[start : start + BLOCK] = _rigid(T[start : start + BLOCK], start)
+    return Poses(T, frames == ["T_obj_cam"], scene_ids, pinholes)
 
 
 def _read_table(path: Path) -> pa.Table:
@@ -142,31 +161,48 @@ def _read_table(path: Path) -> pa.Table:
     raise ValueError(f"its name ends in {kind or 'nothing'}: .csv, .parquet and .json are read")
 
 
-def _numbers(table: pa.Table, name: str) -> Array:
-    """A column [N] float64. Raises ValueError where a value is no finite number."""
+def _numbers(table: pa.Table, name: str, least: float = -np.inf, most: float = np.inf, whole: bool = False) -> Array:
+    """A column [N] float64. Raises ValueError where a value is no finite number, out of bounds, or not whole and must be."""
     try:
-        values = table.column(name).cast(pa.float64()).to_numpy()
+        values = np.array(table.column(name).cast(pa.float64()).to_numpy())
     except pa.ArrowException as error:
         raise ValueError(f"column {name} holds something that is no number: {str(error).splitlines()[0]}") from error
-    if len(wrong := np.flatnonzero(~np.isfinite(values))):
-        raise ValueError(f"row {wrong[0]}: {name} is {values[wrong[0]]}, and must be a finite number")
-    return np.asarray(values, np.float64)
+    for wrong, what in (
+        (~np.isfinite(values), "a finite number"),
+        (~((values >= least) & (values <= most)), f"from {least:g} to {most:g}"),
+        (values != np.rint(values) if whole else np.zeros(0, bool), "a whole number"),
+    ):
+        if wrong.any():
+            raise ValueError(f"row {np.argmax(wrong)}: {name} is {values[np.argmax(wrong)]:g}, and must be {what}")
+    return values
 
 
-def _matrices(column: pa.ChunkedArray) -> Array:
+def _matrices(column: pa.ChunkedArray, name: str) -> Array:
     """[N, 4, 4] of a column of lists of sixteen numbers, of four lists of four, or of such lists as text."""
-    rows = [json.loads(row) if isinstance(row, str) else row for row in column.to_pylist()]
-    for number, row in enumerate(rows):
-        if np.size(row) != 16:
-            raise ValueError(f"row {number}: {column._name or 'the pose'} has {np.size(row)} numbers, and must have 16")
-    return np.array([np.reshape(row, (4, 4)) for row in rows], np.float64).reshape(-1, 4, 4)
+    values = column.combine_chunks()
+    if pa.types.is_list(values.type) and pa.types.is_floating(values.type.value_type):
+        lengths = values.value_lengths()
+        if not values.null_count and (lengths.to_numpy() == 16).all():
+            return np.array(values.flatten().cast(pa.float64()).to_numpy(zero_copy_only=False)).reshape(-1, 4, 4)
+    T = np.empty((len(values), 4, 4))
+    for number, row in enumerate(values):
+        try:
+            T[number] = np.reshape(json.loads(row.as_py()) if pa.types.is_string(row.type) else row.as_py(), (4, 4))
+        except (TypeError, ValueError) as error:
+            given = plain_line(str(row.as_py()), 100)
+            raise ValueError(f"row {number}: {name} is {given}, and must be sixteen numbers") from error
+    return T
 
 
-def _rigid(T: Array) -> Array:
-    """The poses with the nearest rotations. Raises ValueError where one is no rigid transform, with the row and the figure."""
+def _rigid(T: Array, start: int) -> Array:
+    """Poses [N, 4, 4] with the nearest rotations; `start`: the first one's row.
+
+    Raises ValueError where one is no rigid transform, with the row and the figure.
+    """
     faults = {
         "holds something that is no finite number": ~np.isfinite(T).all(axis=(1, 2)),
         "does not end in the row 0 0 0 1": np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(axis=1) > TOLERANCE,
+        f"is more than {MOST_M:g} m away": np.abs(T[:, :3, 3]).max(axis=1) > MOST_M,
     }
     R = np.nan_to_num(T[:, :3, :3])
     off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
@@ -174,11 +210,8 @@ def _rigid(T: Array) -> Array:
     faults["mirrors: its determinant is -1, so an axis of its frame points the other way"] = np.linalg.det(R) < 0.0
     for what, wrong in faults.items():
         if wrong.any():
-            raise ValueError(
-                f"row {int(np.argmax(wrong))}: the pose {what}: {np.round(T[np.argmax(wrong)], 4).tolist()}"
-            )
-    if not len(T):
-        raise ValueError("has no rows")
+            row = int(np.argmax(wrong))
+            raise ValueError(f"row {start + row}: the pose {what}: {np.round(T[row], 4).tolist()}")
     u, _, v = np.linalg.svd(R)
     rigid = T.copy()
     rigid[:, :3, :3] = np.where(off[:, None, None] > 1e-12, u @ v, R)

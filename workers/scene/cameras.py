@@ -92,14 +92,12 @@ def frame_cameras(job: Job, plan: ScenePlan, poses: Sequence[Pose]) -> ScenePlan
     """The plan with input cameras that frame its objects, where the orbit says so, in the directions that were drawn.
 
     poses: `T_world_obj` [4, 4] of each object.
-    Raises ViewError `not_framed` where a camera at a given distance stands nearer to an object than the object is large, or
-    where the objects do not fit into the picture and the range of depth.
+    Raises ViewError `not_framed` where a camera at a given distance stands nearer to an object than the object is large, or where
+    the objects do not fit into the picture and the range of depth.
     """
-    placed = list(zip(plan.objects, poses, strict=True))
-    cameras = plan.input_cameras
-    if job.cameras.orbit.share is not None:
-        framed = (_frame(job, plan, camera, placed, job.cameras.orbit.share) for camera in cameras)
-        return replace(plan, input_cameras=tuple(framed))
+    placed, cameras = list(zip(plan.objects, poses, strict=True)), plan.input_cameras
+    if (share := job.cameras.orbit.share) is not None:
+        return replace(plan, input_cameras=tuple(_frame(job, plan, camera, placed, share) for camera in cameras))
     for start, T in placed:
         box = start.asset.shape.bounds
         size, middle = float(np.linalg.norm(box[1] - box[0])), transform(T, box.mean(axis=0)[None, :])[0]
@@ -187,7 +185,8 @@ def place_more(
                 intrinsics_of(entry, Intrinsics.of(job.cameras.sensor)),
             )
             if entry.poses is None:
-                stands = ((T, k) for T in _stands(entry, rng, _Placed.of(plan, poses), k, plan.input_cameras[0]))
+                placed, first = _Placed.of(plan, poses), plan.input_cameras[0]
+                stands = ((T, k) for T in _stands(entry, rng, placed, k, first, job.images.depth_range_m))
             else:
                 table = read_poses(tables[entry.name])
                 T_world = poses[0] if table.of_object else np.eye(4)
@@ -241,11 +240,11 @@ class _Placed:
             return np.array(about)
         return {"object": self.middle, "table": self.top, "world": np.zeros(3)}[about]
 
-    def fit_m(self, share: float, k: Intrinsics) -> float:
-        """Distance from which the bounding sphere covers this share of the picture, and no edge cuts it off.
+    def fit_m(self, share: float, k: Intrinsics, depth_range_m: Range) -> float:
+        """Distance from which the bounding sphere covers this share of the picture, or so much farther as edges and depth ask.
 
         A sphere of radius R at distance d is drawn about the principal point as an ellipse of the half axes fx t and fy t,
-        with t = R / sqrt(d^2 - R^2). Raises ViewError `not_framed` where the principal point is outside of the picture.
+        with t = R / sqrt(d^2 - R^2). Raises ViewError `not_framed` where there is no such distance.
         """
         edge = min(min(k.cx, k.width - k.cx) / k.fx, min(k.cy, k.height - k.cy) / k.fy)
         if edge <= 0.0:
@@ -254,12 +253,21 @@ class _Placed:
                 f"the principal point ({k.cx:g}, {k.cy:g}) is not within the {k.width} x {k.height} pixels, so that radius_m fit "
                 "frames nothing: give radius_m in metres, or set cx and cy",
             )
-        return self.radius_m * math.hypot(
-            1.0, 1.0 / min(math.sqrt(share * k.width * k.height / (math.pi * k.fx * k.fy)), INSIDE * edge)
-        )
+        half = min(math.sqrt(share * k.width * k.height / (math.pi * k.fx * k.fy)), INSIDE * edge)
+        nearest_m = self.radius_m + max(NEAR_M, depth_range_m.low) / INSIDE
+        fit_m = max(self.radius_m * math.hypot(1.0, 1.0 / half), nearest_m)
+        if fit_m + self.radius_m > depth_range_m.high:
+            raise ViewError(
+                "not_framed",
+                f"the objects are {2.0 * self.radius_m:.3g} m across together: a camera that frames them does not see them "
+                f"within images.depth_range_m, up to {depth_range_m.high:g} m: use smaller ones, or widen that",
+            )
+        return fit_m
 
 
-def _stands(entry: More, rng: np.random.Generator, placed: _Placed, k: Intrinsics, first: Camera) -> Iterator[Pose]:
+def _stands(
+    entry: More, rng: np.random.Generator, placed: _Placed, k: Intrinsics, first: Camera, depth_range_m: Range
+) -> Iterator[Pose]:
     """`T_world_cam` of each camera of an entry's rings and spheres; `first`: the scene's first input camera."""
     centre, unit_m = placed.point(entry.about), 1.0
     if entry.preset is not None:
@@ -267,7 +275,7 @@ def _stands(entry: More, rng: np.random.Generator, placed: _Placed, k: Intrinsic
         unit_m = (placed.side_m if preset.of == "side" else placed.radius_m) / preset.unit_m
     for orbit in entry.orbits:
         fit = share_of(orbit.radius_m, SPHERE_SHARE)
-        fit_m = 1.0 if fit is None else placed.fit_m(fit, k)
+        fit_m = 1.0 if fit is None else placed.fit_m(fit, k, depth_range_m)
         directions = _ring(orbit, rng, first) if isinstance(orbit, Ring) else _sphere(orbit, rng)
         for draw in directions:
             for _ in range(MOST_DRAWS):

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from services.read.independent.rays import Array
+from services.read.independent.rays import NEAR_M, Array
 
 Entry = Mapping[str, Any]
 
@@ -84,10 +84,14 @@ def beside_transform(entry: Entry) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What cameras are placed about: points [N, 3] of the objects at rest, world; the table's height."""
+    """What cameras are placed about: points [N, 3] of the objects at rest, world; the table's height.
+
+    nearest_m: the least depth that is stored.
+    """
 
     points: Array
     top_m: float
+    nearest_m: float
 
     @property
     def side_m(self) -> float:
@@ -125,7 +129,7 @@ def check_stands(entry: Entry, T: Array, subject: Subject, sensor: Entry, T_firs
         towards = away / distance_m[:, None]
         if (off := np.abs(towards + part[:, :3, 2]).max()) > STORED:
             yield f"does not look at {entry['about']}: its axis is off by {off:.3g}"
-        low, high = _distances(orbit["radius_m"], subject.radius_m, unit_m, sensor)
+        low, high = _distances(orbit["radius_m"], subject, unit_m, sensor)
         if not (low * (1.0 - STORED) <= distance_m.min() and distance_m.max() <= high * (1.0 + STORED)):
             yield f"stands {distance_m.min():.6g} to {distance_m.max():.6g} m away, radius_m gives {low:.6g} to {high:.6g}"
         for name, ends, values in (
@@ -142,14 +146,14 @@ def check_stands(entry: Entry, T: Array, subject: Subject, sensor: Entry, T_firs
         yield from _check_pattern(orbit, towards, T_first)
 
 
-def _distances(radius_m: object, sphere_m: float, unit_m: float, sensor: Entry) -> tuple[float, float]:
+def _distances(radius_m: object, subject: Subject, unit_m: float, sensor: Entry) -> tuple[float, float]:
     """Least and most distance. From d, a sphere of radius R fills a cone whose half angle has the sine R / d."""
     if isinstance(radius_m, str):
         share = FIT if radius_m == "fit" else float(radius_m.rstrip("% ")) / 100.0
         width, height, fx, fy, cx, cy = (sensor[name] for name in ("width", "height", "fx", "fy", "cx", "cy"))
         edges = min(min(cx, width - cx) / fx, min(cy, height - cy) / fy)
         half = math.atan(min(math.sqrt(share * width * height / (math.pi * fx * fy)), INSIDE * edges))
-        return (sphere_m / math.sin(half),) * 2
+        return (max(subject.radius_m / math.sin(half), subject.radius_m + max(NEAR_M, subject.nearest_m) / INSIDE),) * 2
     low, high = (float(end) * unit_m for end in np.broadcast_to(np.array(radius_m), 2))
     return low, high
 

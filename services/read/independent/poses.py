@@ -121,7 +121,8 @@ def _subject(pair: StoredPair) -> Subject:
     at = {region: points @ T[:3, :3].T + T[:3, 3] for region, (points, T) in world.items()}
     objects = [region for region in world if region >= FIRST_OBJECT]
     top_m = float(at[TABLE][:, 2].max()) if TABLE in at else 0.0
-    return Subject(np.concatenate([at[region] for region in objects]), top_m)
+    nearest_m = pair.job["images"]["depth_range_m"][0]
+    return Subject(np.concatenate([at[region] for region in objects]), top_m, nearest_m)
 
 
 def _derive_d_z(pair: StoredPair) -> float:

@@ -12,7 +12,13 @@ TINY = {
     "scenes": 3,
     "run": {"range_size": 1},
     "categories": ["box", "can"],
-    "cameras": {"sensor": {"width": 64, "height": 48, "fx": 52.5, "fy": 52.5, "cx": 32.0, "cy": 24.0}},
+    "cameras": {
+        "sensor": {"width": 64, "height": 48, "fx": 52.5, "fy": 52.5, "cx": 32.0, "cy": 24.0},
+        "more": [
+            {"name": "side", "beside": "input", "offset_m": [0.06, 0, 0]},
+            {"name": "around", "ring": {"count": 2}},
+        ],
+    },
     "images": {"patch": {"width": 16, "height": 12}},
 }
 

@@ -55,6 +55,14 @@ def run_audit(store: LocalStore, count: int = 2, moved_m: float = 0.0) -> Audit:
         return audit(store, count, lambda _: None)
 
 
+def test_what_a_studio_scene_has_no_use_for_is_not_forced(tmp_path):
+    around = {"more": [{"name": "around", "ring": {"count": 2}}]}
+    job = validate_job(merged(SMALL, {"scene": "studio", "scenes": 1, "cameras": around}), "a test")
+    found = audit(run_here(job, tmp_path)[0], 1, lambda _: None)
+    assert (found.faults, found.scenes, found.released) == ([], 1, 0)
+    assert {name for name, tally in found.effects.items() if tally.proven} == {"transparency", "exact_agreement"}
+
+
 def test_a_healthy_dataset_passes_and_each_effect_that_was_left_out_is_proven(made):
     found = run_audit(made, 4)
     assert found.faults == [] and found.same_stack and found.scenes == found.released == 4

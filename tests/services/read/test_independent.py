@@ -251,7 +251,7 @@ def only_named(f: Callable, **changes: Callable) -> Callable:
     return planted
 
 
-def no_alpha_inside(rgb, region, alpha):
+def no_alpha_inside(rgb, alpha):
     return np.dstack([rgb, np.where(alpha == 255, 0, alpha)])
 
 
@@ -305,7 +305,7 @@ WRONG_NAMED: dict[str, tuple[object, str, Callable[[Any], object], dict[str, Any
     "fit": (
         cameras._Placed,
         "fit_m",
-        lambda f: lambda placed, share, k: f(placed, share, k.model_copy(update={"fx": k.fy})),
+        lambda f: lambda placed, share, k, ends: f(placed, share, k.model_copy(update={"fx": k.fy}), ends),
         {},
         "camera hammersley stands",
     ),

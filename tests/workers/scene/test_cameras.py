@@ -4,22 +4,31 @@ import dataclasses
 import io
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import trimesh
 
+from schemas.errors import AssetSourceError, ViewError
 from schemas.scene.scene import ScenePlan
 from services.read.audit import verify_independently
 from services.read.dataset_reader import find_scene
 from tests.datasets import faults_of, make_dataset, overlaid
-from tests.effects.scenes import Setting, make
+from tests.effects.scenes import Setting, context_of, make
 from tests.kit.shapes import asset_of, box
+from workers.assets.poses import read_poses
+from workers.capture.results import open_sources
 from workers.geometry.camera import look_at
 from workers.geometry.hull import hull_of
+from workers.scene.make_scene import make_scene
 from workers.scene.studio import scaled_to
+from workers.stopwatch import Stopwatch
 
 BAND = [0.35, 1.3]
 ABOVE: dict[str, dict[str, Any]] = {
@@ -172,3 +181,170 @@ def test_entries_change_no_byte_of_one_another_or_of_pairs():
         single = make(Setting({**noisy, "cameras": {"more": [entry]}})).files
         assert single.items() <= all_of_them.items()
         assert any(f"_{entry['name']}_" in path for path in single)
+
+
+def poses_file(folder: Path, name: str, content: object) -> str:
+    """A table of this content: text, bytes, rows of JSON, or an Arrow table."""
+    path = folder / name
+    if isinstance(content, pa.Table):
+        pq.write_table(content, path)
+    elif content is not None:
+        text = content if isinstance(content, str | bytes) else json.dumps(content)
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return str(path)
+
+
+STANDING = np.eye(4)
+STANDING[2, 3] = 2.0
+
+
+def row(change: tuple[int, int, float] | None = None, /, **more: object) -> dict[str, object]:
+    """A row of a table, with one number changed."""
+    T = STANDING.copy()
+    if change is not None:
+        T[change[:2]] = change[2]
+    return {"T_world_cam": T.ravel().tolist(), **more}
+
+
+HEAD = ",".join(f"T{i}{j}" for i in range(4) for j in range(4))
+PINHOLE = {"fx": 50, "fy": 50, "cx": 32, "cy": 24, "width": 64, "height": 48}
+BAD_POSES: dict[str, tuple[object, str]] = {
+    "nan.json": ([row(), row((0, 3, math.nan))], "row 1: the pose holds something that is no finite number"),
+    "mirror.json": ([row((0, 0, -1.0))], "row 0: the pose mirrors"),
+    "scaled.json": ([row((0, 0, 1.1))], "row 0: the pose is no rotation"),
+    "last.json": ([row((3, 2, 1.0))], "row 0: the pose does not end in the row 0 0 0 1"),
+    "far.json": ([row((0, 3, 1e9))], "row 0: the pose is more than 1000 m away"),
+    "ragged.json": ([row(), {"T_world_cam": [1, 2]}], "row 1: T_world_cam is [1.0, 2.0], and must be sixteen numbers"),
+    "nested.json": (
+        [{"T_world_cam": [[1, 0, 0, 0], [0, 1, 0]]}],
+        "row 0: T_world_cam is [[1, 0, 0, 0], [0, 1, 0]], and",
+    ),
+    "null.parquet": (pa.table({"T_world_cam": pa.array([None], pa.list_(pa.float64()))}), "row 0: T_world_cam is None"),
+    "missing.json": ([row(scene_id=0)], "1 of 2 scenes have no row, the first is 1: add theirs"),
+    "half.json": ([row(scene_id=0.5)], "row 0: scene_id is 0.5, and must be a whole number"),
+    "both.json": ([row(T_obj_cam=[0.0] * 16)], "has the columns T_world_cam and T_obj_cam: give one of them"),
+    "part.json": ([row(fx=100)], "has the columns fx: give all of"),
+    "pixels.json": ([row(**PINHOLE | {"width": 10.5})], "row 0: width is 10.5, and must be a whole number"),
+    "large.json": ([row(**PINHOLE | {"height": 5000})], "row 0: height is 5000, and must be from 1 to 4096"),
+    "focal.json": ([row(**PINHOLE | {"fy": 0})], "row 0: fy is 0, and must be from 0.001"),
+    "many.json": ([row()] * 1001, "every scene has 1001 rows, and must have 1 to 1000"),
+    "other.csv": ("b,a\n1,2\n", "its columns are b, a"),
+    "text.csv": (f"{HEAD}\n{','.join(['x'] * 16)}\n", "column T00 holds something that is no number"),
+    "cut.csv": (f"{HEAD}\n1,2\n", "CSV parse error"),
+    "rowless.csv": (f"{HEAD}\n", "has no rows"),
+    "empty.json": ("", "Expecting value"),
+    "rowless.json": ("[]", "has no rows"),
+    "tree.json": ("{}", "is no list of rows"),
+    "deep.json": ("[" * 100_000, "maximum recursion depth"),
+    "bytes.json": (b'["\xff"]', "can't decode"),
+    "cut.parquet": (b"PAR1", "Parquet"),
+    "poses.txt": ("1", "its name ends in .txt: .csv, .parquet and .json are read"),
+    "absent.csv": (None, "absent.csv cannot be read: No such file"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_POSES)
+def test_a_table_of_poses_that_cannot_be_used_is_refused_by_row_and_value(tmp_path, name):
+    content, told = BAD_POSES[name]
+    job = Setting({"scenes": 2, "cameras": {"more": [{"name": "a", "poses": poses_file(tmp_path, name, content)}]}}).job
+    with pytest.raises(AssetSourceError) as caught:
+        open_sources(job, tmp_path)
+    line = str(caught.value)
+    assert line.startswith("cameras.more.0.poses: ") and name in line and told in line and "\n" not in line, line
+
+
+def test_a_table_of_poses_is_read_alike_in_every_form_and_its_digest_is_in_the_sources(tmp_path):
+    T = [look_at(np.array([x, 0.9, 1.6]), np.zeros(3)) for x in (-0.4, 0.7)]
+    lines = "\n".join([HEAD, *(",".join(map(repr, each.ravel().tolist())) for each in T)])
+    forms = {
+        "flat.json": [{"T_world_cam": each.ravel().tolist()} for each in T],
+        "text.json": [{"T_world_cam": json.dumps(each.tolist())} for each in T],
+        "a.csv": lines,
+        "a.parquet": pa.table({"T_world_cam": [each.ravel().tolist() for each in T]}),
+    }
+    digests = set()
+    for name, content in forms.items():
+        job = Setting({"cameras": {"more": [{"name": "a", "poses": poses_file(tmp_path, name, content)}]}}).job
+        catalogue = open_sources(job, tmp_path)
+        digests.add(catalogue.digest)
+        assert np.abs(read_poses(catalogue.poses["a"]).T - T).max() < 1e-12
+    poses_file(tmp_path, "a.csv", lines.replace("1.6", "1.7"))
+    job = Setting({"cameras": {"more": [{"name": "a", "poses": str(tmp_path / "a.csv")}]}}).job
+    assert len(digests | {open_sources(job, tmp_path).digest}) == len(forms) + 1
+
+
+NO_VIEW: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
+    "below": (
+        {"ring": {"count": 2, "inclination_rad": -0.9, "radius_m": 2.0}},
+        {},
+        "camera a, number 0, .* is below the floor",
+    ),
+    "object": ({"ring": {"count": 2, "radius_m": 0.01}}, {}, "camera a, number 0, .* is inside of can"),
+    "table": (
+        {"ring": {"count": 1, "inclination_rad": -0.5, "radius_m": 0.02}, "about": "table"},
+        {},
+        "camera a, number 0, .* is inside of the table",
+    ),
+    "off": (
+        {"ring": {"count": 1}, "sensor": {"width": 64, "height": 48, "cx": -5.0}},
+        {},
+        r"the principal point \(-5, 240\) is not within the 64 x 48 pixels",
+    ),
+    "far": (
+        {"ring": {"count": 1, "radius_m": "1%"}, "fov_deg": 1},
+        {},
+        "does not see them within images.depth_range_m",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", NO_VIEW)
+def test_a_camera_that_cannot_stand_there_makes_a_failure_that_names_it(name):
+    entry, job, told = NO_VIEW[name]
+    with pytest.raises(ViewError, match=told):
+        make(Setting({**job, "cameras": {"more": [{"name": "a", **entry}]}}))
+
+
+def test_views_that_miss_the_object_say_so_and_fit_keeps_small_and_flat_things_in_range(tmp_path):
+    """A camera that looks away, one whose principal point is far outside; fit as near as depth begins."""
+    away = look_at(np.array([0.0, 0.9, 1.6]), np.array([0.0, 1.8, 2.0])).ravel().tolist()
+    more = [
+        {"name": "away", "poses": poses_file(tmp_path, "away.json", [{"T_world_cam": away}])},
+        {"name": "off", "ring": {"count": 1, "radius_m": 1.0}, "sensor": {"width": 64, "height": 48, "cx": 5000.0}},
+    ]
+    store, _ = make_dataset(tmp_path / "out", scenes=1, cameras={"more": more}, check={"raycast_share": 1.0})
+    rows = find_scene(store, 0).rows
+    for name in ("away", "off"):
+        (view,) = (each for each in rows["views"] if each["role"] == name)
+        (label,) = (each for each in rows["objects"] if each["role"] == name and each["region_id"] == 3)
+        assert (view["object_pixels"], label["u"], label["v"], label["pixels"]) == (0, -1, -1, 0)
+    assert faults_of(store) == verify_independently(store, 1, lambda _: None).faults == []
+    for mesh in (box(0.004, 0.004, 0.004), box(0.2, 0.2, 1e-7)):
+        around = {"more": [{"name": "a", "ring": {"count": 4}}], "orbit": {"radius_m": "fit"}}
+        made = make(alone(mesh, cameras=around, images={"depth_range_m": [0.2, 13.0]}, check={"raycast_share": 1.0}))
+        for view in (view for _, view in made.scene.views() if view.role == "a"):
+            assert (view.region > 0).any() and (view.depth[view.region > 0] > 0).all()
+
+
+@pytest.mark.minute
+def test_a_thousand_views_of_a_scene_take_no_more_memory_than_a_hundred():
+    code = """
+import resource, sys
+from tests.workers.scene.test_cameras import views_of_a_ring
+views_of_a_ring(10), views_of_a_ring(100)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+views_of_a_ring(1000)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert float(done.stdout.split()[-1]) < 1000 * 128 * 128 * 7 / 2**20 / 2  # half of what the images of all take
+
+
+def views_of_a_ring(count: int) -> None:
+    """Draws each view of a ring, and keeps none."""
+    sensor = {"width": 128, "height": 128, "fx": 128.0, "fy": 128.0, "cx": 64.0, "cy": 64.0}
+    setting = Setting(
+        {"scene": "studio", "cameras": {"sensor": sensor, "more": [{"name": "a", "ring": {"count": count}}]}}
+    )
+    scene = make_scene(context_of(setting.job), 0, Stopwatch())
+    assert sum(1 for _ in scene.views()) == count + 1
