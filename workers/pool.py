@@ -36,26 +36,26 @@ Item = TypeVar("Item")
 
 @contextmanager
 def alone_in(folder: Path, lock: str, name: str, wait: bool = False) -> Iterator[None]:
-    """Within the block no other process has this file `lock` of a folder, which is made. name: of the command that writes there.
+    """Within the block no other process has a file `lock` below a folder, which is made. name: of the command that writes there.
 
     Raises InUseError where another has it, or waits, and OutputError where the folder cannot be written.
     """
     is_new = not folder.exists()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = open(folder / lock, "ab")  # noqa: SIM115 - closed below
+        (folder / lock).parent.mkdir(parents=True, exist_ok=True)
+        file = open(folder / lock, "ab")  # noqa: SIM115 - a lock that ends with the process, however it ends; closed below
     except OSError as error:
-        raise OutputError(f"{folder} cannot be written: {error.strerror or error}; choose another --out") from error
+        raise OutputError(f"{folder} cannot be written: {error.strerror or error}; choose another folder") from error
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError as error:
-            raise InUseError(f"another `{name}` writes {folder}: wait for it, or choose another --out") from error
+            raise InUseError(f"another `{name}` writes {folder}: wait for it, or choose another folder") from error
         try:
             yield
         except BaseException:
-            if is_new and not os.path.getsize(file.name):  # nothing stays of what was not begun
-                with suppress(OSError):
+            with suppress(OSError):
+                if is_new and not os.path.getsize(file.name):  # nothing stays of what was not begun
                     os.unlink(file.name)
                     folder.rmdir()
             raise

@@ -15,18 +15,18 @@ import json
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import chain, product
 from pathlib import Path
 from typing import Any, Final
 
 import guesses
-import mirror_depth
 import numpy as np
 import occupancy
 import pyarrow as pa
 import pyarrow.parquet as pq
 import trimesh
-from guesses import Prediction, Predictor, mesh_of, regions_of
+from guesses import Prediction, Predictor, mesh_of, regions_of, write
 from mirror_depth import pairs_of_split
 from numpy.typing import NDArray
 
@@ -34,7 +34,7 @@ from schemas.dataset.layout import PixelKind
 from schemas.errors import InputError, VersoError, plural
 from schemas.job.job import Job
 from schemas.job.views import DepthNoise, RgbNoise, SensorEffects
-from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
+from schemas.scene.shape import Mesh
 from schemas.scene.view import ROLES
 from services.dataset.dataset import Dataset, open_dataset
 from services.dataset.pair import Pair
@@ -135,35 +135,15 @@ def inside(points: NDArray, mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
     return np.abs(winding_numbers(points.astype(np.float64), shape)) > 0.5
 
 
-def train_depth(dataset: Dataset) -> Predictor:
-    """The U-Net of train_mirror_depth.py: every object in its crop before the planes of table top and floor."""
+def train_depth(dataset: Dataset, noise: bool = False) -> Predictor:
+    """The U-Net of train_mirror_depth.py; noise: it learns from each pair twice, as stored and with level 3's input view."""
     import train_mirror_depth as depth
 
     fix_numbers()
     net = depth.Net()
-    depth.train(net, depth.load(dataset.place), depth.EPOCHS)
-
-    def predict(pair: Pair) -> Prediction:
-        depth_m = planes(pair)
-        for region in regions_of(pair):
-            if (example := mirror_depth.make_example(pair, region)) is not None:
-                window = tuple(slice(at, at + n) for at, n in zip(example.corner, mirror_depth.CROP, strict=True))
-                depth_m[window] = mirror_depth.nearest(depth_m[window], depth.complete(net, example))
-        return Prediction(depth_m)
-
-    return predict
-
-
-def planes(pair: Pair) -> NDArray[np.float32]:
-    """[H, W] depth of table top and floor in the mirror view, metres."""
-    assert pair.mirror is not None
-    k = pair.mirror.camera.intrinsics
-    depth_m = np.zeros((k.height, k.width), np.float32)
-    rows, columns = mirror_depth.CROP
-    for row, column in product(range(0, k.height, rows), range(0, k.width, columns)):
-        here = depth_m[row : row + rows, column : column + columns]
-        here[:] = mirror_depth.put_planes(pair, pair.mirror, (row, column))[0][: here.shape[0], : here.shape[1]]
-    return depth_m
+    senses = [partial(sense_input, job=dataset.job)] if noise else []
+    depth.train(net, depth.load(dataset.place, *senses), depth.EPOCHS)
+    return depth.predictor(net)
 
 
 def train_volume(dataset: Dataset) -> Predictor:
@@ -202,44 +182,16 @@ BASELINES: Final[Mapping[str, Callable[[Dataset], Predictor]]] = {
     "symmetry": lambda dataset: guesses.complete_by_symmetry,
     "nearest training shape": find_shapes,
     "mirror-depth network": train_depth,
+    "mirror-depth network with noise": partial(train_depth, noise=True),
     "occupancy network": train_volume,
 }
 """What makes a predictor of a dataset, by name."""
 
-NETWORKS: Final = ("mirror-depth network", "occupancy network")
+NETWORKS: Final = ("mirror-depth network", "mirror-depth network with noise", "occupancy network")
 """Those that PyTorch trains."""
 
 
 # ---------------------------------------------------------------------------------------------------- predictions and scores
-
-
-def write(folder: Path, pair: Pair, said: Prediction) -> None:
-    """Puts a prediction into a folder as `verso score` reads it."""
-    assert pair.mirror is not None
-    name, files = f"{pair.mirror.pose_id:05d}", dict[str, Any]()
-    if said.depth_m is not None:
-        units = np.rint(said.depth_m * pair.mirror.depth_units_per_m)
-        files[f"depth/{name}.png"] = encode_png(np.clip(units, 0, 65535).astype(np.uint16))
-    if said.rgb is not None:
-        files[f"rgb/{name}.png"] = encode_png(said.rgb)
-    for region in regions_of(pair):
-        stem = name + (f"obj{region - REGION_FIRST_OBJECT}" if region > REGION_FIRST_OBJECT else "")
-        if region in said.shapes:
-            files[f"shape/{stem}.ply"] = trimesh.exchange.ply.export_ply(said.shapes[region])
-        if region in said.volumes:
-            (folder / "volume").mkdir(parents=True, exist_ok=True)
-            np.save(folder / "volume" / f"{stem}.npy", said.volumes[region])
-    for path, data in files.items():
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_bytes(data)
-    if said.poses:
-        table = folder / "poses.csv"
-        lines = [] if table.exists() else ["scene_id,im_id,obj_id,R,t\n"]
-        for region, T in said.poses.items():
-            R, t = (" ".join(map(repr, part.ravel().tolist())) for part in (T[:3, :3], 1e3 * T[:3, 3]))
-            lines.append(f"{pair.scene_id},{pair.mirror.pose_id},{region},{R},{t}\n")
-        with table.open("a") as file:
-            file.writelines(lines)
 
 
 class SensedFiles:
@@ -286,7 +238,7 @@ def folder_of(out: Path, name: str, level: str) -> Path:
 def score(dataset: Dataset, folder: Path, level: str) -> pa.Table:
     """The items of a level, as `verso score --level` writes them. Raises InputError where one is missing."""
     given, store = find_predictions(folder), open_store(dataset.place)
-    asked = Asked(given.kinds, split=LEVELS[level][0], level=level)
+    asked = Asked(given.kinds, level=level)
     table = items_of(pq.read_table(score_dataset(store, given, asked, folder / f"score{level}")))
     if count := sum(status == "missing" for status in table["status"].to_pylist()):
         raise InputError(

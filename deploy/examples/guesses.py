@@ -1,11 +1,12 @@
-"""What may be said of the other side without training: the benchmark's baselines that need one pair alone. Pure.
+"""What may be said of the other side without training: the benchmark's baselines that need one pair alone; and how it is written.
 
 Each takes a pair and gives a `Prediction` of its mirror view from its input view; docs/benchmark.md compares them.
 """
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import mirror_depth
 import numpy as np
@@ -19,6 +20,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT
 from services.dataset.pair import Pair
 from services.dataset.view import View
 from workers.geometry.projection import forward_project
+from workers.store.images import encode_png
 
 ANGLES, SHIFTS = 24, 24
 """Directions and places of the upright planes that are tried."""
@@ -50,6 +52,35 @@ class Prediction:
 
 
 Predictor = Callable[[Pair], Prediction]
+
+
+def write(folder: Path, pair: Pair, said: Prediction) -> None:
+    """Puts a prediction into a folder as `verso score` reads it."""
+    assert pair.mirror is not None
+    name, files = f"{pair.mirror.pose_id:05d}", dict[str, Any]()
+    if said.depth_m is not None:
+        units = np.rint(said.depth_m * pair.mirror.depth_units_per_m)
+        files[f"depth/{name}.png"] = encode_png(np.clip(units, 0, 65535).astype(np.uint16))
+    if said.rgb is not None:
+        files[f"rgb/{name}.png"] = encode_png(said.rgb)
+    for region in regions_of(pair):
+        stem = name + (f"obj{region - REGION_FIRST_OBJECT}" if region > REGION_FIRST_OBJECT else "")
+        if region in said.shapes:
+            files[f"shape/{stem}.ply"] = trimesh.exchange.ply.export_ply(said.shapes[region])
+        if region in said.volumes:
+            (folder / "volume").mkdir(parents=True, exist_ok=True)
+            np.save(folder / "volume" / f"{stem}.npy", said.volumes[region])
+    for path, data in files.items():
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_bytes(data)
+    if said.poses:
+        table = folder / "poses.csv"
+        lines = [] if table.exists() else ["scene_id,im_id,obj_id,R,t\n"]
+        for region, T in said.poses.items():
+            R, t = (" ".join(map(repr, part.ravel().tolist())) for part in (T[:3, :3], 1e3 * T[:3, 3]))
+            lines.append(f"{pair.scene_id},{pair.mirror.pose_id},{region},{R},{t}\n")
+        with table.open("a") as file:
+            file.writelines(lines)
 
 
 def regions_of(pair: Pair) -> list[int]:

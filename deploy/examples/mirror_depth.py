@@ -1,4 +1,4 @@
-"""The pairs of a split, what a network may know of one before it sees the mirror view, the baseline made of that, and the scores.
+"""The pairs of a split, and what a network may know of one before it sees the mirror view.
 
 Everything lies in a crop of the mirror image about the place where the object's seen points fall. Nothing but the input
 view, the two cameras and the planes of table top and floor goes into it: the mirror view is the answer alone.
@@ -6,6 +6,7 @@ view, the two cameras and the planes of table top and floor goes into it: the mi
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import pyarrow as pa
@@ -47,8 +48,6 @@ CROP = (96, 128)
 """Rows and columns, as the article's patches."""
 SCALE_M = 0.1
 """Depths are given to the network relative to the object's seen points, in this unit."""
-SEEN_M = 0.01
-"""A mirror pixel's surface counts as seen where the input depth there is nearer than it by less than this."""
 CHANNELS = 11
 
 Image = NDArray[np.float32]
@@ -58,19 +57,15 @@ Image = NDArray[np.float32]
 class Example:
     """One pair in the crop; images [H, W] float32 in metres unless said otherwise.
 
-    features [C, H, W]; baseline: the projection, holes filled, planes put in; background: the planes alone; turned: the seen
-    points and the same turned by half a turn about the object's assumed axis. Truth: depth, 0 where unknown; mask [H, W]
-    bool, the object; unseen [H, W] bool, that part of it that the input view does not show. `middle_m`: the depth that
-    features count from. `corner`: row and column of the crop's first pixel in the mirror image.
+    features [C, H, W]; background: the planes of table top and floor. Truth: depth, 0 where unknown; mask [H, W] bool, the
+    object. `middle_m`: the depth that features count from. `corner`: row and column of the crop's first pixel in the mirror
+    image.
     """
 
     features: Image
-    baseline: Image
     background: Image
-    turned: Image
     depth: Image
     mask: NDArray[np.bool_]
-    unseen: NDArray[np.bool_]
     middle_m: float
     corner: tuple[int, int]
 
@@ -93,15 +88,11 @@ def make_example(pair: Pair, region: int = REGION_FIRST_OBJECT) -> Example | Non
     middle = float(np.median(cloud[:, 2]))
     background, gap = put_planes(pair, mirror, corner)
     seen, other = (close_holes(splat(mirror, points, corner)) for points in (cloud, turned))
-    baseline = nearest(seen, background)
     color = splat_values(mirror, cloud, rgb[here & (depth > 0)], corner)
     features = stack_features(seen, other, background, color, gap, middle)
     window = np.s_[corner[0] : corner[0] + CROP[0], corner[1] : corner[1] + CROP[1]]
     truth, mask = mirror.depth_m()[window], mirror.segment()[window] == region
-    hidden = is_unseen(view, depth, mirror, truth, corner) & mask
-    return Example(
-        features, baseline, background, nearest(seen, other, background), truth, mask, hidden, middle, corner
-    )
+    return Example(features, background, truth, mask, middle, corner)
 
 
 def unproject(view: Pixels, depth: Image, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -201,6 +192,18 @@ def put_planes(pair: Pair, mirror: View, corner: tuple[int, int]) -> tuple[Image
     return np.where(inside & (table > 0), table, floor), floor - table
 
 
+def planes(pair: Pair) -> Image:
+    """[H, W] depth of table top and floor in the mirror view, metres."""
+    assert pair.mirror is not None
+    k = pair.mirror.camera.intrinsics
+    depth_m = np.zeros((k.height, k.width), np.float32)
+    rows, columns = CROP
+    for row, column in product(range(0, k.height, rows), range(0, k.width, columns)):
+        here = depth_m[row : row + rows, column : column + columns]
+        here[:] = put_planes(pair, pair.mirror, (row, column))[0][: here.shape[0], : here.shape[1]]
+    return depth_m
+
+
 def half_turn(points: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
     """The points turned by 180 degrees about a vertical axis, as if the object were as deep as it is wide.
 
@@ -224,34 +227,3 @@ def stack_features(seen: Image, other: Image, background: Image, color: Image, g
     rows, columns = np.meshgrid(np.linspace(-1, 1, CROP[0]), np.linspace(-1, 1, CROP[1]), indexing="ij")
     maps = [*relative, seen > 0, other > 0, plane, gap - 1, rows, columns, *np.moveaxis(color, -1, 0)]
     return np.stack(maps).astype(np.float32)
-
-
-def is_unseen(view: View, depth: Image, mirror: View, truth: Image, corner: tuple[int, int]) -> NDArray[np.bool_]:
-    """Whether the surface at each mirror pixel is not what the input view shows in its direction."""
-    rows, columns = np.nonzero(truth > 0)
-    place, z = (rows + corner[0], columns + corner[1]), truth[rows, columns].astype(np.float64)
-    surface = camera.unproject(*place, z, mirror.camera.intrinsics)
-    points = transform(np.linalg.inv(view.T_world_cam) @ mirror.T_world_cam, surface)
-    y, x = pixels_of(view, points)
-    inside = (y >= 0) & (x >= 0) & (y < depth.shape[0]) & (x < depth.shape[1])
-    front = np.where(inside, depth[np.clip(y, 0, depth.shape[0] - 1), np.clip(x, 0, depth.shape[1] - 1)], 0)
-    unseen = np.ones(truth.shape, bool)
-    unseen[rows, columns] = np.abs(points[:, 2] - front) > SEEN_M
-    return unseen
-
-
-@dataclass(frozen=True)
-class Scores:
-    """Mean errors of predicted depth, millimetres."""
-
-    l1_mm: float
-    mask_l1_mm: float
-    unseen_l1_mm: float
-
-
-def score(predicted: Image, example: Example) -> Scores:
-    """L1 over all known pixels, over the object's mask and over its unseen part."""
-    known = example.depth > 0
-    error = 1000 * np.abs(predicted - example.depth)
-    parts = (known, known & example.mask, known & example.unseen)
-    return Scores(*(float(error[part].mean()) if part.any() else float("nan") for part in parts))

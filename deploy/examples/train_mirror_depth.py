@@ -1,15 +1,12 @@
-"""Trains a small network to predict the mirror view's depth from the input view, and scores it on held-out instances.
+"""Trains a small network to predict the mirror view's depth from the input view, and has it predict held-out instances.
 
 PYTHONPATH=. .venv/bin/python deploy/examples/train_mirror_depth.py data/training [--epochs N] [--out DIR]
 
-The network sees what the baseline is made of (mirror_depth.py), and says for each pixel whether the object is there and how
-deep. The baseline is the projection of the input view, splatted and its holes filled, with the planes of table top and
-floor put in.
+The network sees the projection of the input view, the same turned by half a turn, and the planes of table top and floor
+(mirror_depth.py), and says for each pixel whether the object is there and how deep. DIR/predictions is what `verso score` reads.
 """
 
 import argparse
-import dataclasses
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,13 +14,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from mirror_depth import CHANNELS, SCALE_M, Example, Split, make_example, pairs_of_split, score
+from guesses import Prediction, Predictor, regions_of, write
+from mirror_depth import CHANNELS, CROP, SCALE_M, Example, Split, make_example, nearest, pairs_of_split, planes
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import DataLoader, TensorDataset
 from torch.utils.data import Dataset as TorchDataset
 
 from services.dataset.dataset import open_dataset
+from services.dataset.pair import Pair
 
 BATCH = 16
 RATE = 2e-3
@@ -36,18 +35,18 @@ class MirrorDepthPairs(TorchDataset):
     """Pairs of one split by instance; an item is a dict of tensors [..., H, W] as `mirror_depth.Example` tells them.
 
     The ids are looked up once; images are read and decoded when an item is asked for, so that worker processes of a
-    DataLoader share nothing.
+    DataLoader share nothing. sense: what lies between a stored pair and the network, such as noise.
     """
 
-    def __init__(self, place: str, split: Split) -> None:
-        self._pairs = open_dataset(place)
+    def __init__(self, place: str, split: Split, sense: Callable[[Pair], Pair] = lambda pair: pair) -> None:
+        self._pairs, self._sense = open_dataset(place), sense
         self.ids = [pair.pose_id for pair in pairs_of_split(self._pairs, split)]
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        example = make_example(self._pairs.pair(self.ids[index]))
+        example = make_example(self._sense(self._pairs.pair(self.ids[index])))
         if example is None:  # too near the rim: the next one stands in
             return self[(index + 1) % len(self)]
         known = (example.depth > 0)[None]
@@ -107,10 +106,10 @@ def loss_of(net: Net, batch: dict[str, Tensor]) -> Tensor:
     return functional.binary_cross_entropy_with_logits(logit, batch["mask"].float()) + error[mask].mean()
 
 
-def load(place: str) -> dict[str, Tensor]:
-    """All training pairs in memory: some hundred are small."""
-    pairs = MirrorDepthPairs(place, "train")
-    return stack([pairs[number] for number in range(len(pairs))])
+def load(place: str, *senses: Callable[[Pair], Pair]) -> dict[str, Tensor]:
+    """All training pairs in memory, as stored and by each sense: some thousand are small."""
+    splits = [MirrorDepthPairs(place, "train"), *(MirrorDepthPairs(place, "train", sense) for sense in senses)]
+    return stack([pairs[number] for pairs in splits for number in range(len(pairs))])
 
 
 def stack(items: list[dict[str, Tensor]]) -> dict[str, Tensor]:
@@ -147,14 +146,18 @@ def complete(net: Net, example: Example) -> np.ndarray:
     return np.where(logit[0, 0].numpy() > 0, depth[0, 0].numpy(), example.background).astype(np.float32)
 
 
-def evaluate(net: Net, place: str) -> dict[str, dict[str, float]]:
-    """Mean scores over the test split of the network, the baseline, its half turn and the planes alone."""
-    scores: dict[str, list[dict[str, float]]] = {}
-    for example in filter(None, map(make_example, pairs_of_split(open_dataset(place), "test"))):
-        answers = {"network": complete(net, example), "baseline": example.baseline, "half turn": example.turned}
-        for name, answer in {**answers, "planes alone": example.background}.items():
-            scores.setdefault(name, []).append(dataclasses.asdict(score(answer, example)))
-    return {name: {key: float(np.nanmean([item[key] for item in of])) for key in of[0]} for name, of in scores.items()}
+def predictor(net: Net) -> Predictor:
+    """Says the mirror view's depth: every object in its crop before the planes of table top and floor."""
+
+    def predict_pair(pair: Pair) -> Prediction:
+        depth_m = planes(pair)
+        for region in regions_of(pair):
+            if (example := make_example(pair, region)) is not None:
+                window = tuple(slice(at, at + n) for at, n in zip(example.corner, CROP, strict=True))
+                depth_m[window] = nearest(depth_m[window], complete(net, example))
+        return Prediction(depth_m)
+
+    return predict_pair
 
 
 def read_options(about: str, epochs: int) -> argparse.Namespace:
@@ -163,7 +166,7 @@ def read_options(about: str, epochs: int) -> argparse.Namespace:
     parser.add_argument("place", metavar="DATASET", help="a folder, or a bucket")
     parser.add_argument("--epochs", type=int, default=epochs, help=f"default: {epochs}")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="folder for network.pt and what else is kept")
+    parser.add_argument("--out", type=Path, help="folder for network.pt and predictions")
     options = parser.parse_args()
     torch.manual_seed(options.seed)
     return options
@@ -175,26 +178,26 @@ def tell_size(net: nn.Module, data: dict[str, Tensor]) -> None:
     print(f"{pairs} training pairs, {weights / 1e3:.0f} thousand weights", flush=True)
 
 
-def keep(net: nn.Module, scores: dict[str, dict[str, float]], options: argparse.Namespace) -> None:
+def keep(net: nn.Module, options: argparse.Namespace) -> None:
     """Write network.pt, if `--out` names a folder."""
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
-        kept = {"weights": net.state_dict(), "scores": scores, "epochs": options.epochs, "seed": options.seed}
+        kept = {"weights": net.state_dict(), "epochs": options.epochs, "seed": options.seed}
         torch.save(kept, options.out / "network.pt")
 
 
 def main() -> None:
-    """Train, score, print, and keep the network."""
+    """Train, and keep the network and its predictions."""
     options = read_options(__doc__, EPOCHS)
     data, net = load(options.place), Net()
     tell_size(net, data)
     train(net, data, options.epochs)
-    scores = evaluate(net, options.place)
-    keep(net, scores, options)
-    print(f"{'':14}{'L1':>10}{'in mask':>10}{'unseen':>10}")
-    for name, means in scores.items():
-        print(f"{name:14}{''.join(f'{value:7.1f} mm' for value in means.values())}")
-    print(json.dumps(scores))
+    keep(net, options)
+    if options.out is not None:
+        folder, predict = options.out / "predictions", predictor(net)
+        for pair in pairs_of_split(open_dataset(options.place), "test"):
+            write(folder, pair, predict(pair))
+        print(f"score it with: ./verso score {options.place} {folder} --split test")
 
 
 if __name__ == "__main__":

@@ -97,7 +97,7 @@ def main() -> None:
     tell_size(net, data)
     train(net, data, options.epochs, loss_of)
     scores = evaluate(net, options.place)
-    keep(net, scores, options)
+    keep(net, options)
     print(f"{'IoU':12}{''.join(f'{group:>8}' for group in scores['network'])}")
     for name, means in scores.items():
         print(f"{name:12}{''.join(f'{value:8.3f}' for value in means.values())}")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Weight
 from schemas.errors import did_you_mean
@@ -276,6 +276,17 @@ class MeshLimits(Frozen):
     """Most memory for reading an asset, MiB."""
 
 
+USUAL_DENSITY = 600.0
+"""kg/m^3: of wood, or of things with hollows."""
+
+
+Density = Annotated[
+    Annotated[Positive, Tag("[number]")]
+    | Annotated[dict[CategoryName, Positive], Field(min_length=1), Tag("[by category]")],
+    Discriminator(lambda value: "[by category]" if isinstance(value, dict) else "[number]"),
+]
+
+
 class Assets(Frozen):
     """Where objects and tables come from; sources are mixed by weight."""
 
@@ -285,10 +296,15 @@ class Assets(Frozen):
     """Sources of tables."""
     split: SplitShares = SplitShares()
     """Shares of instances in train, val and test."""
-    density_kg_m3: Positive = 600.0
-    """Density of a watertight solid."""
+    density_kg_m3: Density = USUAL_DENSITY
+    """Density of a watertight solid; or by category, `{mug: 2400}`, where others have the default."""
     shell_kg_m2: Positive = 3.0
     """Surface density of a mesh that is not watertight, a thin shell."""
+
+    def density_of(self, category: str) -> float:
+        """kg/m^3 of a watertight solid of this category."""
+        given = self.density_kg_m3
+        return given.get(category, USUAL_DENSITY) if isinstance(given, dict) else given
 
     @field_validator("objects")
     @classmethod

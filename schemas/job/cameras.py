@@ -5,12 +5,12 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from schemas.base import Folder, Frozen, Interval, Range, ordered, value_kind
 
-Focal = Annotated[float, Field(ge=1e-3, le=1e6)]
-Principal = Annotated[float, Field(ge=-1e6, le=1e6)]
+FocalLength = Annotated[float, Field(ge=1e-3, le=1e6)]
+PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
 Reach = Annotated[float, Field(gt=0, le=1e3)]
 Offset = Annotated[float, Field(ge=-1e3, le=1e3)]
 """Bounds far beyond any camera, within which float32 on the GPU does not overflow."""
@@ -35,8 +35,33 @@ Framed = Annotated[
 ]
 """A distance: metres, [least, most] to draw from, `fit`, or a share of the picture."""
 Behind = Annotated[
-    Annotated[Reach, Tag("[number]")] | Annotated[Literal["fit"], Tag("[word]")], Discriminator(value_kind)
+    Annotated[Reach, Tag("[number]")] | Annotated[ReachRange, Tag("[list]")] | Annotated[Literal["fit"], Tag("[word]")],
+    Discriminator(value_kind),
 ]
+
+
+def _number_kind(value: object) -> str:
+    return "[list]" if isinstance(value, list | tuple) else "[number]"
+
+
+Focal = Annotated[
+    Annotated[FocalLength, Tag("[number]")]
+    | Annotated[tuple[FocalLength, FocalLength], AfterValidator(lambda ends: ordered(Range(*ends))), Tag("[list]")],
+    Discriminator(_number_kind),
+]
+Principal = Annotated[
+    Annotated[PrincipalPoint, Tag("[number]")]
+    | Annotated[
+        tuple[PrincipalPoint, PrincipalPoint], AfterValidator(lambda ends: ordered(Range(*ends))), Tag("[list]")
+    ],
+    Discriminator(_number_kind),
+]
+"""A number, or [least, most] to draw from for each input camera."""
+
+
+def at_share(value: float | tuple[float, float], share: float) -> float:
+    """The number, or of a range this share of the way from its least to its most."""
+    return value[0] + share * (value[1] - value[0]) if isinstance(value, tuple) else value
 
 
 def share_of(radius_m: object, fit: float) -> float | None:
@@ -44,6 +69,15 @@ def share_of(radius_m: object, fit: float) -> float | None:
     if not isinstance(radius_m, str):
         return None
     return fit if radius_m == "fit" else float(radius_m.rstrip("% ")) / 100.0
+
+
+def _as_interval(value: object) -> object:
+    """One number as both ends of an interval."""
+    return [value, value] if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+OneOrRange = Annotated[Interval, BeforeValidator(_as_interval)]
+"""[least, most] to draw from, or one number."""
 
 
 class Orbit(Frozen):
@@ -56,6 +90,11 @@ class Orbit(Frozen):
     radius_m: Framed = 2.5
     """Distance from the centre of the table top, or [least, most]. `6%`, or `fit` for the same: as near to the middle of the
     objects at rest as they cover that share of the picture, none is cut off, and all are in the range of depth."""
+
+    aim_m: OneOrRange = Range(0.0, 0.0)
+    """Offset of the point looked at along x, y and z, each drawn."""
+    roll_deg: OneOrRange = Range(0.0, 0.0)
+    """Turn of the camera about its optical axis."""
 
     @property
     def share(self) -> float | None:
@@ -71,13 +110,23 @@ class Sensor(Frozen):
     height: Annotated[int, Field(ge=1, le=4096)] = 480
     """Pixels."""
     fx: Focal = 525.0
-    """Focal length, pixels."""
+    """Focal length, pixels; or [least, most], of which fx and fy of one camera are the same share of the way."""
     fy: Focal = 525.0
-    """Focal length, pixels."""
+    """Focal length, pixels, or a range as of fx."""
     cx: Principal = 320.0
-    """Principal point, pixels from the left edge."""
+    """Principal point, pixels from the left edge, or [least, most]."""
     cy: Principal = 240.0
-    """Principal point, pixels from the upper edge."""
+    """Principal point, pixels from the upper edge, or [least, most]."""
+
+    def fixed(self, share: tuple[float, float, float] = (0.5, 0.5, 0.5)) -> "Sensor":
+        """The sensor with one number in the place of each range: this share of the way, of focal lengths, of cx, of cy."""
+        shares = dict(zip(("fx", "fy", "cx", "cy"), (share[0], *share), strict=True))
+        return self.model_copy(update={name: at_share(getattr(self, name), part) for name, part in shares.items()})
+
+    @property
+    def has_ranges(self) -> bool:
+        """Whether a camera's own numbers are drawn."""
+        return any(isinstance(getattr(self, name), tuple) for name in ("fx", "fy", "cx", "cy"))
 
 
 class DepthCamera(Frozen):
@@ -99,13 +148,13 @@ class Mirror(Frozen):
     enabled: bool = True
     """Whether there are mirror views; without them camPoses.csv has the even ids alone."""
     T_z_m: Behind = 1.3
-    """Distance of the mirror camera from its pivot, the point it looks at. `fit`: 1.5 d_z."""
+    """Distance of the mirror camera from its pivot, the point it looks at, or [least, most]. `fit`: 1.5 d_z."""
     percentile: Annotated[float, Field(ge=0, le=100)] = 2.0
     """d_z, the distance to the object's front, is this percentile of its stored input depth; 0: the nearest."""
 
-    def distance_m(self, d_z_m: float) -> float:
-        """T_z, metres, for a pivot d_z_m ahead of the input camera."""
-        return MIRROR_FIT * d_z_m if isinstance(self.T_z_m, str) else self.T_z_m
+    def distance_m(self, d_z_m: float, share: float = 0.5) -> float:
+        """T_z, metres, for a pivot d_z_m ahead of the input camera; of a range this share of the way."""
+        return MIRROR_FIT * d_z_m if isinstance(self.T_z_m, str) else at_share(self.T_z_m, share)
 
 
 MOST_VIEWS = 1000
@@ -122,15 +171,6 @@ def _within(ends: Range, most: float, what: str, named: str) -> Range:
     if max(abs(end) for end in ends) > most + 1e-9:
         raise ValueError(f"[{ends.low:g}, {ends.high:g}]: {what} lies between -{named} and {named}")
     return ends
-
-
-def _as_interval(value: object) -> object:
-    """One number as both ends of an interval."""
-    return [value, value] if isinstance(value, int | float) and not isinstance(value, bool) else value
-
-
-OneOrRange = Annotated[Interval, BeforeValidator(_as_interval)]
-"""[least, most] to draw from, or one number."""
 
 
 class Ring(Frozen):
@@ -229,9 +269,16 @@ class More(Frozen):
     roll_deg: OneOrRange = Range(0.0, 0.0)
     """Turn of each camera about its optical axis."""
     sensor: Sensor | None = None
-    """Its pinhole camera; without it `cameras.sensor`."""
+    """Its pinhole camera; without it that of the camera it is beside, else `cameras.sensor`."""
     fov_deg: FieldOfView | None = None
     """Horizontal field of view, in place of the sensor's fx and fy."""
+
+    @field_validator("sensor")
+    @classmethod
+    def _is_fixed(cls, sensor: Sensor | None) -> Sensor | None:
+        if sensor is not None and sensor.has_ranges:
+            raise ValueError("ranges are drawn for input cameras alone: give one number each of fx, fy, cx, cy")
+        return sensor
 
     @model_validator(mode="after")
     def _is_of_one_kind(self) -> "More":
@@ -268,13 +315,9 @@ class More(Frozen):
     @property
     def count(self) -> int | None:
         """Views in a scene, or for `beside` in a pair; None where a file says it."""
-        return (
-            None
-            if self.poses is not None
-            else 1
-            if self.beside is not None
-            else sum(each.count for each in self.orbits)
-        )
+        if self.poses is not None:
+            return None
+        return 1 if self.beside is not None else sum(each.count for each in self.orbits)
 
 
 class ViewPreset(NamedTuple):
@@ -305,7 +348,7 @@ LENS_35_OF_32_DEG = 2.0 * math.degrees(math.atan(0.5 * 32.0 / 35.0))
 """Horizontal field of view of Blender's lens of 35 mm before 32 mm."""
 
 VIEW_PRESETS: Mapping[str, ViewPreset] = {
-    # cvlab-columbia/zero123, objaverse-rendering/scripts/blender_script.py (lens 35 of 32 mm) and ldm/data/simple.py.
+    # cvlab-columbia/zero123, objaverse-rendering/scripts/blender_script.py and ldm/data/simple.py.
     "zero123": ViewPreset(LENS_35_OF_32_DEG, "side", 1.0, (Sphere(count=12, pattern="cube", radius_m=(1.5, 2.2)),)),
     # liuyuan-pal/SyncDreamer, blender_script.py and meta_info/camera-16.pkl: the sixteen targets.
     "syncdreamer": ViewPreset(

@@ -224,3 +224,6 @@ class Appearance:
     background: tuple[float, float, float]
     """Linear RGB where nothing is hit."""
     below: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sheen: float = 1.0
+    """Share of what Fresnel's term mirrors at grazing angles that is drawn, in the raster tier: light that comes from everywhere
+    alike would draw a pale line along every outline."""

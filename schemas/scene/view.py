@@ -143,8 +143,8 @@ class Intrinsics(Frozen):
 
     @staticmethod
     def of(sensor: Sensor) -> "Intrinsics":
-        """The intrinsics that a job's sensor describes."""
-        return Intrinsics(**sensor.model_dump())
+        """The intrinsics that a job's sensor describes; of its ranges the middle."""
+        return Intrinsics(**sensor.fixed().model_dump())
 
 
 @dataclass(frozen=True, eq=False)

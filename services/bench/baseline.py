@@ -7,6 +7,9 @@ scene's images, and answers with one line of seconds by stage. It uses none of t
 It has two looks. `plain` is what such scripts do: a floor of one colour, one light, no shadows. `same` is what one has to
 write to get images like those of the raster tier: the floor's texture, each of the scene's distant lights, and pyrender's
 own shadows of them. All other settings are pyrender's defaults.
+
+A scene without a table is of one object alone: nothing falls, pictures have alpha, the mask is where there is depth, and normals
+are drawn by a second pass with normals as colours, as such scripts do.
 """
 
 import json
@@ -43,9 +46,10 @@ Images = dict[str, NDArray]
 
 def load_meshes(folder: Path, look: str) -> dict[str, Any]:
     """The meshes of a scene for pyrender."""
-    loaded: dict[str, Any] = {name: trimesh.load(folder / f"{name}.glb") for name in ("floor", "table", "object")}
+    files = {name: folder / f"{name}.glb" for name in ("floor", "table", "object")}
+    loaded: dict[str, Any] = {name: trimesh.load(file) for name, file in files.items() if file.exists()}
     meshes = {name: scene.dump() for name, scene in loaded.items()}
-    if look == "plain":
+    if look == "plain" and "floor" in meshes:
         for mesh in meshes["floor"]:
             mesh.visual = trimesh.visual.ColorVisuals(mesh, face_colors=FLOOR_COLOR)
     return meshes
@@ -79,10 +83,15 @@ def build(
     description: dict[str, Any], meshes: dict[str, Any], T_world_obj: NDArray, look: str
 ) -> tuple[Any, dict[Any, Any]]:
     """The pyrender scene, and the colour of each node in a segmentation pass."""
-    scene = pyrender.Scene(ambient_light=[0.3, 0.3, 0.3], bg_color=[0.8, 0.85, 0.9])
-    poses = {"floor": np.eye(4), "table": np.array(description["T_world_table"]), "object": T_world_obj}
+    alone = description["T_world_table"] is None
+    scene = pyrender.Scene(ambient_light=[0.3, 0.3, 0.3], bg_color=[0.0] * 4 if alone else [0.8, 0.85, 0.9])
+    poses = {"object": T_world_obj}
+    if not alone:
+        poses |= {"floor": np.eye(4), "table": np.array(description["T_world_table"])}
     colors = {}
     for region, name in ((FLOOR, "floor"), (TABLE, "table"), (OBJECT, "object")):
+        if name not in poses:
+            continue
         mesh = pyrender.Mesh.from_trimesh(meshes[name], smooth=False)
         colors[scene.add(mesh, pose=poses[name])] = (region, region, region)
     if look == "same":
@@ -103,6 +112,31 @@ def render(scene: Any, colors: dict, renderer: Any, k: dict[str, float], T_world
     region, _ = renderer.render(scene, flags=pyrender.RenderFlags.SEG, seg_node_map=colors)
     scene.remove_node(node)
     return {"rgb": rgb, "depth": depth, "region": np.ascontiguousarray(region[..., 0])}
+
+
+def build_normals(meshes: dict[str, Any], T_world_obj: NDArray) -> Any:
+    """A pyrender scene of the object alone whose colours are its vertex normals."""
+    scene = pyrender.Scene(ambient_light=[1.0, 1.0, 1.0], bg_color=[0.0] * 4)
+    for mesh in meshes["object"]:
+        colors = np.rint(255.0 * (0.5 + 0.5 * mesh.vertex_normals)).astype(np.uint8)
+        plain = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, vertex_colors=colors)
+        scene.add(pyrender.Mesh.from_trimesh(plain, smooth=True), pose=T_world_obj)
+    return scene
+
+
+def render_alone(scene: Any, normals: Any | None, renderer: Any, k: dict[str, float], T_world_cam: NDArray) -> Images:
+    """Colour with alpha, depth, mask and, of a scene of normals, normals from one camera."""
+    camera = pyrender.IntrinsicsCamera(k["fx"], k["fy"], k["cx"], k["cy"], znear=0.05, zfar=100.0)
+    images = {}
+    for what, where, flags in (
+        ("rgb", scene, pyrender.RenderFlags.RGBA),
+        ("normals", normals, pyrender.RenderFlags.FLAT),
+    ):
+        if where is not None:
+            node = where.add(camera, pose=T_world_cam @ OPTICAL_TO_OPENGL)
+            images[what], depth = renderer.render(where, flags=flags)
+            where.remove_node(node)
+    return images | {"depth": depth, "region": np.where(depth > 0.0, OBJECT, 0).astype(np.uint8)}
 
 
 def project(view: Images, k: dict[str, float], T_target_source: NDArray) -> Images:
@@ -136,8 +170,8 @@ def write(views: dict[str, Images], images: list[dict[str, Any]], units: float, 
             pixels = pixels[top:bottom, left:right]
         if image["pixels"] == "depth":
             pixels = np.clip(pixels * units, 0, 65535).astype(np.uint16)
-        elif image["pixels"] == "rgb":
-            pixels = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+        elif image["pixels"] in ("rgb", "normals"):
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_RGBA2BGRA if pixels.shape[2] == 4 else cv2.COLOR_RGB2BGR)
         path = out / image["path"]
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), pixels)
@@ -157,15 +191,27 @@ def make(description: dict[str, Any], folder: Path, meshes: dict[str, Any], out:
         seconds[stage] += time.perf_counter() - last
         last = time.perf_counter()
 
-    T_world_obj = simulate(description, folder)
+    alone = description["T_world_table"] is None
+    T_world_obj = np.array(description["T_world_obj"]) if alone else simulate(description, folder)
     count("physics")
     scene, colors = build(description, meshes, T_world_obj, look)
+    wanted = {image["pixels"] for pair in description["pairs"] for image in pair["images"]}
+    normals = build_normals(meshes, T_world_obj) if "normals" in wanted else None
     renderer = renderer_of(k["width"], k["height"])
     count("scene")
     for pair in description["pairs"]:
         cameras = {role: np.array(T) for role, T in pair["cameras"].items()}
-        views = {role: render(scene, colors, renderer, k, T, look) for role, T in cameras.items()}
+        views = {}
+        for name, T in cameras.items():
+            if alone:
+                views[name] = render_alone(scene, normals, renderer, k, T)
+            else:
+                views[name] = render(scene, colors, renderer, k, T, look)
         count("render")
+        if "mirror" not in cameras:
+            write(views, pair["images"], description["depth_units_per_m"], out)
+            count("write")
+            continue
         views["projected"] = project(views["input"], k, np.linalg.inv(cameras["mirror"]) @ cameras["input"])
         count("projection")
         write(views, pair["images"], description["depth_units_per_m"], out)

@@ -68,12 +68,19 @@ def main(options: argparse.Namespace) -> int:
 
 def refuse_unmatched(job: Job) -> None:
     """Raises InputError for a job whose scenes the script does not make, or that is stored in tars."""
+    alone, cameras = job.scene == "studio", job.cameras
+    sensors = (cameras.sensor.has_ranges, *(entry.sensor or entry.fov_deg or entry.preset for entry in cameras.more))
     fits = {
         "output.layout: files": job.output.layout == "files",
         "objects_per_scene: 1": job.objects_per_scene == ONE_OBJECT,
-        "cameras.depth.enabled: true": job.cameras.depth.enabled,
-        "cameras.mirror.enabled: true": job.cameras.mirror.enabled,
-        "images.projection.enabled: true": job.images.projection.enabled,
+        "cameras.depth.enabled: true": alone or cameras.depth.enabled,
+        "cameras.mirror.enabled: true": alone or cameras.mirror.enabled,
+        "images.projection.enabled: true": alone or job.images.projection.enabled,
+        "cameras.mirror.enabled: false": not alone or not cameras.mirror.enabled,
+        "cameras.more: []": alone or not cameras.more,
+        "one sensor for all cameras": not any(sensors),
+        "targets.views: []": alone or not job.targets.views,
+        "targets.views: [normals]": not alone or set(job.targets.views) <= {"normals"},
         "render.rgb: true": job.render.rgb,
     }
     if missing := [setting for setting, holds in fits.items() if not holds]:

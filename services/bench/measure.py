@@ -146,7 +146,7 @@ def measure(job: Job, job_folder: Path, folder: Path, scenes: int) -> Measured:
     Nothing is deleted in between: for seconds afterwards ext4 searches the deleted entries whenever it makes a file.
     """
     # The flat tier has no shadows, and a path tracer is no rival of pyrender.
-    looks = LOOKS if job.render.tier == "raster" else ["plain"]
+    looks = LOOKS if job.render.tier == "raster" and job.scene == "tabletop" else ["plain"]
     laps: dict[str, list[Lap]] = {look: [] for look in looks}
     ours: list[Lap] = []
     floor: list[Lap] = []
@@ -207,7 +207,7 @@ def _draw(renderer: Renderer, scenes: Sequence[Scene]) -> tuple[float, float, fl
     """
     upload, wall, cpu = 0.0, 0.0, 0.0
     for scene in scenes:
-        cameras = [view.camera for pair in scene.pairs for view in pair.views if view.role != "projected"]
+        cameras = [view.camera for _, view in scene.views() if view.role != "projected"]
         things, appearance = scene.posed.things, scene.posed.appearance
         begun = time.perf_counter()
         renderer.draw(things, appearance, cameras[0], FLAT)

@@ -10,17 +10,20 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 import trimesh
 
+from schemas.dataset.layout import view_name
 from schemas.environment import FOR_SPEED
 from schemas.errors import MachineError
 from schemas.job.job import Job
-from schemas.scene.view import Pair
+from schemas.scene.view import Pair, View
 from services.bench.figures import Lap
 from workers.assets.glb import asset_glb, mesh_of_part
 from workers.scene.make_scene import Scene
@@ -45,38 +48,42 @@ def hand_over(scene: Scene, job: Job, parent: Path) -> Path:
     """Write `scene.json` and the files that belong to it into a new folder, outside any clock. Returns its path."""
     folder = parent / str(scene.plan.scene_id)
     folder.mkdir(parents=True)
-    start, table = scene.plan.objects[0], scene.plan.table
-    for name, asset in (("object", start.asset), ("table", table.asset)):
+    start, ground = scene.plan.objects[0], scene.plan.ground
+    assets = {"object": start.asset} | ({} if ground is None else {"table": ground.table.asset})
+    for name, asset in assets.items():
         (folder / f"{name}.glb").write_bytes(asset_glb(asset))
         mesh = trimesh.Trimesh(asset.shape.mesh.vertices, asset.shape.mesh.faces, process=False)
         mesh.export(folder / f"{name}.obj", include_normals=False)
         com = " ".join(f"{x:.9g}" for x in asset.mass.com)
         urdf = URDF.format(name=name, com=com, mass=asset.mass.mass_kg, i=np.diag(asset.mass.inertia).tolist())
         (folder / f"{name}.urdf").write_text(urdf)
-    mesh_of_part(scene.posed.things[0].shape.parts[0]).export(folder / "floor.glb")
-    sensor, lights = job.cameras.sensor, scene.posed.appearance.lights
+    if ground is not None:
+        mesh_of_part(ground.floor.parts[0]).export(folder / "floor.glb")
+    sensor, lights = scene.plan.input_cameras[0].intrinsics, scene.posed.appearance.lights
     described = {
-        "T_world_table": table.T_world_table.tolist(),
+        "T_world_table": None if ground is None else ground.table.T_world_table.tolist(),
         "T_world_obj": start.T_world_obj.tolist(),
         "lights": [{"towards": light.direction.tolist(), "color": list(light.color)} for light in lights],
         "intrinsics": {key: getattr(sensor, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "depth_units_per_m": job.images.depth_units_per_m,
-        "pairs": [_pair(pair, job) for pair in scene.pairs],
+        "pairs": [_views(group, job) for _, group in groupby(scene.views(), key=itemgetter(0))],
     }
     path = folder / "scene.json"
     path.write_text(json.dumps(described))
     return path
 
 
-def _pair(pair: Pair, job: Job) -> dict[str, object]:
-    """Poses of the three cameras, and the path, view, kind of pixels and crop (or none) of every image."""
-    cameras = {view.role: view.camera.T_world_cam.tolist() for view in pair.views if view.role != "projected"}
-    images = []
-    for view in pair.views:
+def _views(views: Iterable[tuple[Pair, View]], job: Job) -> dict[str, object]:
+    """Poses of a pair's cameras by name, and the path, view, kind of pixels and crop (or none) of every image."""
+    cameras, images = {}, []
+    for pair, view in views:
+        name = view_name(view.role, view.number)
+        if view.role != "projected":
+            cameras[name] = view.camera.T_world_cam.tolist()
         objects = object_labels(view, pair)
         for path, kind, box in image_boxes(view, objects, objects[0].category, job.images.patch):
             crop = [end for side in box if isinstance(side, slice) for end in (side.start, side.stop)] or None
-            images.append({"path": path, "view": view.role, "pixels": kind, "crop": crop})
+            images.append({"path": path, "view": name, "pixels": kind, "crop": crop})
     return {"cameras": cameras, "images": images}
 
 

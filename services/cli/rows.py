@@ -286,6 +286,7 @@ COMMANDS: Final[dict[str, Command]] = {
         ),
         choice("--up", ("x", "y", "z"), "the axis that points up in all files (default: a guess)"),
         option("--licence", "TEXT", "of the shapes (default: the nearest licence file)"),
+        choice("--scene", ("tabletop", "studio"), "of the job: objects on a table, or each alone", default="tabletop"),
         option(
             "--limit", "NAME=VALUE", "another cap on files, such as max_faces=10000000", action="append", default=[]
         ),

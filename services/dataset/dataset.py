@@ -140,8 +140,6 @@ def _structs(table: pa.Table, key: str, values: pa.ChunkedArray) -> pa.ChunkedAr
 KEPT_BYTES = 256 << 20
 """Rows of ranges that are kept for reading pairs in any order; the last range whatever its size."""
 
-Records = Sequence[CommitRecord]
-
 
 def open_dataset(place: str | Path) -> "Dataset":
     """The dataset in a folder, or in a bucket such as s3://bucket/path; finished or being made, scenes or captures.
@@ -161,7 +159,9 @@ class Dataset:
         self.place = store.name
         self.job: Job = record.job
         """The job that made it, every default filled in."""
-        self._kept: LRUCache[range, _Range] = LRUCache(KEPT_BYTES, lambda kept: min(kept.rows.nbytes, KEPT_BYTES))
+        self._kept: LRUCache[range, tuple[RangeRows, RangeFiles]] = LRUCache(
+            KEPT_BYTES, lambda kept: min(kept[0].nbytes, KEPT_BYTES)
+        )
         """The last ranges that were asked for a scene, by their scenes."""
 
     def __reduce__(self) -> tuple[object, tuple[str]]:
@@ -207,8 +207,7 @@ class Dataset:
     def _pairs(self, where: pc.Expression | None, part: tuple[int, int]) -> Iterator[Pair]:
         for number, records in enumerate(iter_committed(self._store)):
             if number % part[1] == part[0]:
-                opened = self._open_range(records)
-                yield from pairs_of(opened.rows, opened.files, where)
+                yield from pairs_of(*self._open_range(records), where)
 
     def pair(self, pose_id: int) -> Pair:
         """The pair with this id of its input view or of its mirror view. Raises InputError where it is not stored."""
@@ -227,12 +226,12 @@ class Dataset:
             records = find_records(self._store, scene_id)
             scenes = range(records[0].span.start, records[0].span.stop)
             self._kept[scenes] = self._open_range(records)
-        opened = self._kept[scenes]
-        return tuple(pairs_of(opened.rows.of_scene(scene_id), opened.files))
+        rows, files = self._kept[scenes]
+        return tuple(pairs_of(rows.of_scene(scene_id), files))
 
-    def _open_range(self, records: Records) -> "_Range":
-        rows = RangeRows.of(lambda table: range_rows(self._store, records, table))
-        return _Range(rows, RangeFiles(self._files, records))
+    def _open_range(self, records: Sequence[CommitRecord]) -> "tuple[RangeRows, RangeFiles]":
+        """The rows and files of a committed range."""
+        return RangeRows.of(lambda table: range_rows(self._store, records, table)), RangeFiles(self._files, records)
 
 
 @dataclass(frozen=True)
@@ -261,14 +260,6 @@ class RangeRows:
     def nbytes(self) -> int:
         """Bytes in memory."""
         return int(self.pairs.nbytes + self.more.nbytes + self.objects.nbytes + self.assets.nbytes)
-
-
-@dataclass(frozen=True)
-class _Range:
-    """A committed range: its rows and files."""
-
-    rows: RangeRows
-    files: RangeFiles
 
 
 def pairs_of(rows: RangeRows, files: Files, where: pc.Expression | None = None) -> Iterator[Pair]:

@@ -6,7 +6,6 @@ While it is being made, `_export/` in it holds what was asked, how far it came, 
 
 import contextlib
 import csv
-import fcntl
 import io
 import json
 import os
@@ -17,7 +16,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from schemas.errors import CorruptError, InUseError, OutputError
+from schemas.errors import CorruptError, OutputError
+from workers.pool import alone_in
 
 WORK = "_export"
 MANIFEST = "export.json"
@@ -45,21 +45,13 @@ class ExportFolder:
         Raises OutputError where the folder holds somebody else's files, another export, or cannot be written, InUseError
         where another process works in it.
         """
-        try:
-            names = sorted(os.listdir(self.root)) if self.root.exists() else []
-            if names and WORK not in names:
-                message = f"{self.root} holds {', '.join(names[:3])}{' and more' if len(names) > 3 else ''}"
-                raise OutputError(f"{message}: an export goes into a new or an empty folder, choose another DIR")
-            self.work.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            message = f"{self.root} cannot be written: {error.strerror or error}"
-            raise OutputError(f"{message}; choose another DIR") from error
-        with open(self.work / _LOCK, "ab") as file:  # a lock ends with the process, however it ends
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                message = f"another export writes into {self.root}: wait for it, or choose another DIR"
-                raise InUseError(message, str(self.root)) from error
+        names: list[str] = []
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            names = sorted(os.listdir(self.root))
+        if names and WORK not in names:
+            message = f"{self.root} holds {', '.join(names[:3])}{' and more' if len(names) > 3 else ''}"
+            raise OutputError(f"{message}: an export goes into a new or an empty folder, choose another DIR")
+        with alone_in(self.root, f"{WORK}/{_LOCK}", "verso export"):
             known = _read_tree(self.work / _PLAN)
             if known is None:
                 self._write_work(_PLAN, plan)

@@ -229,7 +229,7 @@ class ShardedWriter(Writer):
 
         Samples that the dataset has (`targets.shape`) are copied beside it, as `<instance id>.samples.npz`.
         """
-        for instance_id in (scene.row["table_id"], *(name for _, name in scene.instances.values())):
+        for instance_id in scene.shown:
             asset = scene.assets[instance_id]
             category, samples = asset["category"], asset["samples"]
             path = f"shapes/{category}/{instance_id}"
@@ -284,7 +284,12 @@ def encode_npz(arrays: Mapping[str, NDArray]) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, array in arrays.items():
-            member = io.BytesIO()
-            np.lib.format.write_array(member, array, allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), member.getvalue(), zipfile.ZIP_DEFLATED, 1)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), encode_npy(array), zipfile.ZIP_DEFLATED, 1)
+    return stream.getvalue()
+
+
+def encode_npy(array: NDArray) -> bytes:
+    """What numpy.load reads as one array."""
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, array, allow_pickle=False)
     return stream.getvalue()

@@ -1,8 +1,8 @@
 """Formats of graphics programs, whose cameras look along -z with y up (OpenGL): `gltf` and `nerf` (docs/export.md).
 
 glTF's y is up, the world's z is: a root node turns one into the other. Poses of `nerf` are camera to world, metres, z up; cx, cy
-have pixel centres at +0.5. Its input and mirror views are for training; those of the depth camera beside the input camera,
-where the dataset has them, are for evaluation.
+have pixel centres at +0.5. Its views are for training; those of the depth camera beside the input camera, where the dataset has
+them, are for evaluation. instant-ngp reads `depth_path` and alpha, nerfstudio `depth_file_path` and `mask_path`.
 """
 
 import math
@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from schemas.dataset.codec import Row, read_matrix, read_world_poses
+from schemas.dataset.layout import view_name
 from schemas.errors import CorruptError, SceneError, VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import DRAWN_ROLES, Role
@@ -44,7 +45,7 @@ class Gltf(Writer):
         except (VersoError, OSError) as error:
             reason = f"its shapes cannot be made again: {error.reason}" if isinstance(error, SceneError) else NO_SOURCES
             return [(pair.pose_id, reason) for pair in scene.pairs]
-        views = [pair.views[role] for pair in scene.pairs for role in pair.drawn]
+        views = [pair.views[role] for pair in scene.pairs for role in pair.all_drawn]
         seen = with_cameras(posed.export(file_type="glb"), views)
         self.folder.put(f"{scene.category}/{scene.scene_id:06d}.glb", seen)
         self.count("files", scene.category)
@@ -56,7 +57,7 @@ class Gltf(Writer):
             "files": self.counts("files"),
             "not_exported": ["images and labels: the cameras stand where the views were taken from"],
             "frame": "metres; below the root node the world frame of the dataset, z up, turned to glTF's y up by that node",
-            "cameras": "named by role and pose id; a field of view and an aspect ratio, without the principal point",
+            "cameras": "named by role, number and pose id; a field of view and an aspect ratio, without the principal point",
         }
 
 
@@ -67,7 +68,7 @@ def with_cameras(glb: bytes, views: list[Row]) -> bytes:
     roots = list(tree["scenes"][0]["nodes"])
     for view in views:
         matrix = read_matrix(view["T_world_cam"]) @ OPENGL_FROM_OPTICAL
-        name = f"{view['role']} {view['pose_id']}"
+        name = f"{view_name(view['role'], view['number'])} {view['pose_id']}"
         roots.append(len(nodes))
         nodes.append({"name": name, "camera": len(cameras), "matrix": matrix.T.ravel().tolist()})
         width, height = view["width"] / view["fx"], view["height"] / view["fy"]
@@ -97,8 +98,8 @@ class Nerf(Writer):
         """Writes the pair's views, where all have colour."""
         if reason := pair.lacks_colour():
             return reason
-        for role in pair.drawn:
-            self._frames[role].append(self._write(pair, role))
+        for name in pair.all_drawn:
+            self._frames.setdefault(pair.views[name]["role"], []).append(self._write(pair, name))
         return ""
 
     def end_scene(self, scene: ExportScene) -> None:
@@ -123,13 +124,14 @@ class Nerf(Writer):
         rgb, depth, region = pair.image(role, "rgb"), pair.depth(role, MM_PER_M), pair.pixels(role, "region")
         assert rgb is not None and depth is not None and region is not None
         files = {"images": rgb, "depths": depth, "masks": encode_mask(region >= REGION_FIRST_OBJECT)}
-        keys = {"images": "file_path", "depths": "depth_file_path", "masks": "mask_path"}
+        keys = {"images": ("file_path",), "depths": ("depth_file_path", "depth_path"), "masks": ("mask_path",)}
         kinds = ["images"] if self._lens else list(files)
         for kind in kinds:
             self.folder.put(f"{self._folder}/{kind}/{name}", files[kind])
         matrix = read_matrix(view["T_world_cam"]) @ OPENGL_FROM_OPTICAL
         sizes = {key: view[column] for key, column in _SIZES.items()}
-        return {**{keys[kind]: f"{kind}/{name}" for kind in kinds}, **sizes, "transform_matrix": matrix.tolist()}
+        paths = {key: f"{kind}/{name}" for kind in kinds for key in keys[kind]}
+        return {**paths, **sizes, "transform_matrix": matrix.tolist()}
 
     def describe(self) -> dict[str, Any]:
         """Scenes by split, and the conventions."""
@@ -147,11 +149,16 @@ class Nerf(Writer):
 def transforms(frames: Mapping[Role, list[Row]], lens: Mapping[str, float], scene: ExportScene) -> Row:
     """The tree of transforms.json; `objects` is for people: those loaders do not look at it."""
     paths = {role: [frame["file_path"] for frame in of] for role, of in frames.items()}
-    training = [path for role in SIDES for path in paths.get(role, [])]
-    held_out = [path for role in paths if role not in SIDES for path in paths[role]] or training
+    beside = [role for role in DRAWN_ROLES if role not in SIDES]
+    training = [path for role in paths if role not in beside for path in paths[role]]
+    held_out = [path for role in beside for path in paths.get(role, [])] or training
     poses = read_world_poses(scene.row)
+    every = [frame for of in frames.values() for frame in of]
+    pinholes = [{key: frame[key] for key in _SIZES} for frame in every]
     return {
         "camera_model": "OPENCV",
+        **(pinholes[0] if all(pinhole == pinholes[0] for pinhole in pinholes) else {}),
+        "integer_depth_scale": 1.0 / MM_PER_M,
         **lens,
         "train_filenames": training,
         "val_filenames": held_out,
@@ -160,5 +167,5 @@ def transforms(frames: Mapping[Role, list[Row]], lens: Mapping[str, float], scen
             {"category": category, "instance_id": name, "transform_matrix": np.asarray(poses[region_id]).tolist()}
             for region_id, (category, name) in scene.instances.items()
         ],
-        "frames": [frame for of in frames.values() for frame in of],
+        "frames": every,
     }

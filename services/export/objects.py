@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.dataset.codec import Row, read_camera, read_matrix
 from services.export.formats import ObjectWriter, encode_json, encode_npz, sample_mesh
-from services.export.source import SIDES, ExportPair, ExportScene
+from services.export.source import ExportPair, ExportScene
 from workers.geometry.camera import unproject
 from workers.geometry.frames import invert, transform
 
@@ -126,7 +126,7 @@ def points_of(stored: Mapping[str, NDArray]) -> dict[str, dict[str, NDArray]]:
 
 def crops_of(pair: ExportPair, region_id: int, asset: Row) -> Iterator[tuple[bytes, dict[str, list]]]:
     """(JPEG, camera_mat and world_mat) of each view that has colour and the whole sphere about the object's box."""
-    for role in SIDES:
+    for role in pair.sides:
         label = pair.label(role, region_id)
         if label is None or not label["pixels"] or (pixels := pair.pixels(role, "rgb")) is None:
             continue
@@ -188,7 +188,7 @@ class Pcn(ObjectWriter):
         """Writes what each view shows of an object, and its complete cloud with the first."""
         (category, instance_id), asset = scene.instances[region_id], scene.assets[scene.instances[region_id][1]]
         diagonal, split = math.hypot(*asset["extents_m"]), asset["split"]
-        clouds = {role: seen_points(pair, role, region_id) / diagonal for role in SIDES}
+        clouds = {role: seen_points(pair, role, region_id) / diagonal for role in pair.sides}
         clouds = {role: points for role, points in clouds.items() if len(points) >= FEWEST}
         if not clouds:
             return NO_POINTS

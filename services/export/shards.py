@@ -3,7 +3,8 @@
 In `webdataset` numbers are no PNG, because the usual decoders of WebDataset turn every picture into colours: 16 bits into 8, and
 region ids into shares of 255. In `huggingface` targets of 3 x 16 bits are plain bytes, because Pillow, which decodes images for
 `datasets`, makes 8 bits of them without a word. Its columns come from the manifest's schemas: what a view has is a struct
-`<role>_view`, its images are the columns `<role>_rgb`, `<role>_depth`, `<role>_region` and image targets.
+`<role>_view`, its images are the columns `<role>_rgb`, `<role>_depth`, `<role>_region` and image targets; of a camera of
+`cameras.more`, which may have several views in a pair, these are lists, in order of their numbers.
 """
 
 import hashlib
@@ -31,7 +32,7 @@ from services.export.source import ExportPair, ExportScene
 _COLOURS: Final = tuple(name for name, kind in MODALITIES.items() if (kind.channels, kind.dtype) == (3, "uint8"))
 """Modalities that are stored as PNG files; those of numbers are arrays."""
 _OF_SCENE: Final = (*OF_SCENE, "effects")
-_NOT_OF_VIEWS: Final = ("files", "scene_id", "category", "parent_id", "capture")
+_NOT_OF_VIEWS: Final = ("files", "scene_id", "category", "parent_id", "capture", "number")
 """Columns that stand elsewhere in a sample."""
 _NOT_OF_OBJECTS: Final = ("scene_id", "pose_id")
 
@@ -64,11 +65,11 @@ def members_of(scene: ExportScene, pair: ExportPair) -> list[tuple[str, bytes]]:
     members: list[tuple[str, bytes]] = []
     for kind, modality in MODALITIES.items():
         if kind in _COLOURS:
-            images = {role: pair.image(role, kind) for role in ROLES}
+            images = {name: pair.image(name, kind) for name in pair.names}
             members += [(f"{role}.{kind}.png", data) for role, data in images.items() if data is not None]
         else:
             read = pair.stack if modality.each else pair.pixels
-            arrays = {role: array for role in ROLES if (array := read(role, kind)) is not None}
+            arrays = {name: array for name in pair.names if (array := read(name, kind)) is not None}
             if arrays or modality.target is None:
                 members.append((f"{kind}.npz", encode_npz(arrays)))
     return [*members, ("json", _json(scene, pair))]
@@ -78,18 +79,17 @@ def _json(scene: ExportScene, pair: ExportPair) -> bytes:
     """The rows of a pair, without what is stored elsewhere in the sample."""
     tree: Row = {name: scene.row[name] for name in _OF_SCENE}
     tree |= {"split": scene.split, "pose_id": pair.pose_id, "views": {}}
-    for role in ROLES:
-        if (view := pair.views.get(role)) is not None:
-            labels = [_label(row) for row in pair.labels(role)]
-            columns = {name: value for name, value in view.items() if name not in _NOT_OF_VIEWS}
-            tree["views"][role] = {**columns, "objects": labels}
+    for name in pair.names:
+        labels = [_label(row) for row in pair.labels(name)]
+        columns = {key: value for key, value in pair.views[name].items() if key not in _NOT_OF_VIEWS}
+        tree["views"][name] = {**columns, "objects": labels}
     return json.dumps(tree).encode()
 
 
 def _label(row: Row) -> Row:
     """A row of `objects` without what is stored elsewhere in the sample, and without columns of targets that are not there."""
     absent = [name for name in OF_TARGETS["objects"] if row[name] is None]
-    return {name: value for name, value in row.items() if name not in (*_NOT_OF_OBJECTS, "role", *absent)}
+    return {name: value for name, value in row.items() if name not in (*_NOT_OF_OBJECTS, "role", "number", *absent)}
 
 
 class _Tar:
@@ -111,14 +111,18 @@ class _Tar:
 
 SPLIT_NAMES: Final = {split: split for split in SPLITS} | {"val": "validation"}
 """Ours, and Hugging Face's name for it."""
-ROW_GROUP: Final = 16
-"""Pairs in a row group: some ten megabytes, which is what a reader holds."""
+ROW_GROUP, ROW_GROUP_BYTES = 16, 50_000_000
+"""Pairs in a row group, and bytes of images that end it earlier: some ten megabytes, which is what a reader holds."""
 
 IMAGE: Final = pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())])
 """An image as Hugging Face stores it."""
 IMAGES: Final = pa.list_(IMAGE)
 """One for each object, by region."""
-_PICTURES: Final = (IMAGE, IMAGES, pa.binary())
+
+
+def _has_pictures(kind: pa.DataType) -> bool:
+    """Whether a column's type is that of images, or of lists of them."""
+    return kind in (IMAGE, pa.binary()) or (pa.types.is_list(kind) and _has_pictures(kind.value_type))
 
 
 class HuggingFace(ShardedWriter):
@@ -143,8 +147,8 @@ class HuggingFace(ShardedWriter):
 
     def end_scene(self, scene: ExportScene) -> None:
         """Remembers the licences of what the scene shows."""
-        names = (scene.row["table_id"], *(name for _, name in scene.instances.values()))
-        self.kept["licences"] = sorted({*self.kept["licences"], *(scene.assets[name]["licence"] for name in names)})
+        licences = (scene.assets[name]["licence"] for name in scene.shown)
+        self.kept["licences"] = sorted({*self.kept["licences"], *licences})
         super().end_scene(scene)
 
     def finish(self) -> None:
@@ -171,7 +175,10 @@ def schema_of_pairs(job: Job) -> pa.Schema:
     for role in stored_roles(job):
         fields += [pa.field(f"{role}_{image.pixels}", _type_of(image.pixels)) for image in stored_images(role, job)]
         fields.append(pa.field(f"{role}_view", views))
-    absent = () if job.targets.views else OF_TARGETS["objects"]
+    for entry in job.cameras.more:
+        images = [(image.pixels, pa.list_(_type_of(image.pixels))) for image in stored_images(entry.name, job)]
+        fields += [pa.field(f"{entry.name}_{kind}", of) for kind, of in (*images, ("view", pa.list_(views)))]
+    absent = {*(() if job.targets.views else OF_TARGETS["objects"]), *(() if job.cameras.more else ("number",))}
     objects = pa.struct([field for field in SCHEMAS["objects"] if field.name not in (*_NOT_OF_OBJECTS, *absent)])
     schema = pa.schema([*fields, pa.field("objects", pa.list_(objects))])
     # So that `datasets` knows which columns are images.
@@ -193,15 +200,16 @@ def row_of(schema: pa.Schema, scene: ExportScene, pair: ExportPair) -> Row:
     row |= {"split": SPLIT_NAMES[scene.split], "pose_id": pair.pose_id, "objects": list(pair.objects)}
     for name in schema.names:
         role, _, kind = name.partition("_")
-        if kind == "view":
-            row[name] = pair.views.get(role)
-        elif kind in MODALITIES:
-            row[name] = _cell(pair, role, kind)
+        if kind != "view" and kind not in MODALITIES:
+            continue
+        views = [role] if role in ROLES else [each for each in pair.named if pair.views[each]["role"] == role]
+        cells = [pair.views.get(each) if kind == "view" else _cell(pair, each, kind) for each in views]
+        row[name] = cells[0] if role in ROLES else cells
     return row
 
 
 def _cell(pair: ExportPair, role: Role, kind: PixelKind) -> Any:
-    """What the column of a view's image holds."""
+    """What a view has in the column of an image, or in its place of the column's list."""
     name, of = f"{pair.pose_id:09d}.{role}.{kind}", _type_of(kind)
     if of == IMAGES:
         return [{"bytes": data, "path": f"{name}{n}.png"} for n, data in enumerate(pair.images(role, kind))]
@@ -213,24 +221,24 @@ class _Parquet:
     """A Parquet file being written, a row group at a time."""
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
-        plain = [name for name in schema.names if schema.field(name).type not in _PICTURES]
+        plain = [name for name in schema.names if not _has_pictures(schema.field(name).type)]
         self._writer = pq.ParquetWriter(
             path, schema, compression="snappy", use_dictionary=plain, write_statistics=plain
         )
         self._schema = schema
         self._rows: list[Row] = []
-        self.bytes = 0
+        self.bytes = self._written = 0
 
     def add(self, row: Row) -> None:
         self._rows.append(row)
         self.bytes += sum(map(_bytes_in, row.values()))
-        if len(self._rows) == ROW_GROUP:
+        if len(self._rows) == ROW_GROUP or self.bytes - self._written > ROW_GROUP_BYTES:
             self._flush()
 
     def _flush(self) -> None:
         if self._rows:
             self._writer.write_table(pa.Table.from_pylist(self._rows, self._schema), row_group_size=ROW_GROUP)
-            self._rows = []
+            self._rows, self._written = [], self.bytes
 
     def close(self) -> None:
         self._flush()
@@ -265,8 +273,8 @@ def card_text(name: str, export: str, schema: pa.Schema, rows: Mapping[str, int]
     """
     files = "".join(f"\n  - split: {split}\n    path: data/{split}-*.parquet" for split in sorted(rows)) or " []"
     counts = "".join(f"- {split}: {plural(count, 'pair')}\n" for split, count in sorted(rows.items()))
-    columns = "".join(f"- `{field.name}`: {_describe(field)}\n" for field in schema)
-    wide = _WIDE if any(field.type == pa.binary() for field in schema) else ""
+    columns = "".join(f"- `{field.name}`: {_describe_column(field)}\n" for field in schema)
+    wide = _WIDE if any(field.type in (pa.binary(), pa.list_(pa.binary())) for field in schema) else ""
     return f"""---
 license: {"cc0-1.0" if set(licences) <= {"CC0-1.0"} else "other"}
 pretty_name: {json.dumps(name)}
@@ -281,9 +289,9 @@ configs:
 
 # {name}
 
-View-dependent RGB-D pairs for reconstructing objects from a single view: an input view of an object on a table, and the mirror
-view from the other side. Made by Verso after {ARTICLE}. A row is a pair. Splits are by object: no object of `test` or
-`validation` is seen in `train`.
+Views with depth for reconstructing objects from a single view. A row is a pair: an input view of an object, and what the job has
+of the mirror view from the other side and of views of further cameras. Made by Verso after {ARTICLE}.
+Splits are by object: no object of `test` or `validation` is seen in `train`.
 
 {counts}
 Licences of the shapes: {", ".join(licences) or "none"}.
@@ -315,13 +323,19 @@ _WIDE: Final = """\
 """
 
 
-def _describe(field: pa.Field) -> str:
-    if field.type == IMAGE:
+def _describe_column(field: pa.Field) -> str:
+    of_pair = field.name == "objects" or field.name.partition("_")[0] in ROLES
+    named = pa.types.is_list(field.type) and not of_pair
+    return f"for each view: {_describe(field.type.value_type)}" if named else _describe(field.type)
+
+
+def _describe(kind: pa.DataType) -> str:
+    if kind == IMAGE:
         return "image"
-    if field.type in (IMAGES, pa.binary()):
-        return "list of images, one for each object" if field.type == IMAGES else "PNG of 3 x 16 bits, as bytes"
-    if pa.types.is_list(field.type):
-        return "list of " + ", ".join(f"`{item.name}`" for item in field.type.value_type)
-    if pa.types.is_struct(field.type):
-        return "struct of " + ", ".join(f"`{item.name}`" for item in field.type)
-    return "matrix" if pa.types.is_fixed_size_list(field.type) else str(field.type)
+    if kind in (IMAGES, pa.binary()):
+        return "list of images, one for each object" if kind == IMAGES else "PNG of 3 x 16 bits, as bytes"
+    if pa.types.is_list(kind):
+        return "list of " + ", ".join(f"`{item.name}`" for item in kind.value_type)
+    if pa.types.is_struct(kind):
+        return "struct of " + ", ".join(f"`{item.name}`" for item in kind)
+    return "matrix" if pa.types.is_fixed_size_list(kind) else str(kind)

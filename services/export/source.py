@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
 from schemas.dataset.commit import CommitRecord
-from schemas.dataset.layout import PixelKind, patch_index
+from schemas.dataset.layout import PixelKind, patch_index, view_name
 from schemas.job.assets import SplitShares
 from schemas.scene.shape import REGION_FIRST_OBJECT
-from schemas.scene.view import DRAWN_ROLES, Role
+from schemas.scene.view import DRAWN_ROLES, ROLES, Role
 from services.dataset.dataset import Splits, collect_ids, split_by_category, strictest
 from services.read.dataset_reader import (
     ReadFile,
@@ -39,7 +39,10 @@ MM_PER_M = 1000.0
 
 @dataclass(frozen=True, eq=False)
 class ExportPair:
-    """A pair of views: the rows of `views` by role, of `objects`, and its images as the PNG bytes that are stored."""
+    """A pair of views, and the views of cameras of `cameras.more` that go with it.
+
+    The rows of `views` by name (`view_name`), of `objects`, and its images as the PNG bytes that are stored.
+    """
 
     number: int
     """Its place among the pairs of its scene, from 0."""
@@ -57,14 +60,41 @@ class ExportPair:
         """The roles of its views that are drawn, in order."""
         return [role for role in DRAWN_ROLES if role in self.views]
 
-    def lacks_colour(self) -> str:
-        """Why it is left out of what needs the colour of every drawn view, or nothing."""
-        missing = [role for role in self.drawn if self.image(role, "rgb") is None]
+    @property
+    def named(self) -> list[Role]:
+        """The names of the views of named cameras, in order."""
+        return [name for name in self.views if name not in ROLES]
+
+    @property
+    def names(self) -> list[Role]:
+        """The names of all views, in the order of `ROLES` and then of `named`."""
+        return [*(role for role in ROLES if role in self.views), *self.named]
+
+    @property
+    def all_drawn(self) -> list[Role]:
+        """The names of all views that are drawn, in order."""
+        return [*self.drawn, *self.named]
+
+    @property
+    def sides(self) -> list[Role]:
+        """The names of the views from other sides: `SIDES`, and those of named cameras."""
+        return [*(role for role in SIDES if role in self.views), *self.named]
+
+    def lacks_colour(self, *names: Role) -> str:
+        """Why it is left out of what needs the colour of these views, of every drawn one where none is named; or nothing."""
+        missing = [name for name in names or self.all_drawn if self.image(name, "rgb") is None]
         return f"no rgb of the {missing[0]} view" if missing else ""
+
+    @cached_property
+    def _labels(self) -> dict[Role, list[Row]]:
+        by_name: dict[Role, list[Row]] = {}
+        for row in sorted(self.objects, key=itemgetter("region_id")):
+            by_name.setdefault(view_name(row["role"], row["number"]), []).append(row)
+        return by_name
 
     def labels(self, role: Role) -> list[Row]:
         """Rows of `objects` of one view, by region: the table first."""
-        return sorted((row for row in self.objects if row["role"] == role), key=itemgetter("region_id"))
+        return self._labels.get(role, [])
 
     def label(self, role: Role, region_id: int) -> Row | None:
         """The row of `objects` of one region in one view, None where the view is not stored."""
@@ -99,6 +129,14 @@ class ExportPair:
         data = self.image(role, kind)
         return None if data is None else decode_png(data, f"{kind} of the {role} view of pose {self.pose_id}")
 
+    def alone(self, role: Role, region_id: int) -> bytes:
+        """The PNG of a view's colour as RGBA: as stored, or with the pixels of an object as alpha. The view has colour."""
+        data, rgb, region = self.image(role, "rgb"), self.pixels(role, "rgb"), self.pixels(role, "region")
+        assert data is not None and rgb is not None and region is not None
+        if rgb.shape[2] == 4:
+            return data
+        return encode_png(np.dstack([rgb, np.where(region == region_id, np.uint8(255), np.uint8(0))]))
+
     def depth(self, role: Role, units_per_m: float) -> bytes | None:
         """The PNG of a view's depth in other units; what does not fit 16 bits becomes 0, as all depth out of range."""
         data = self.image(role, "depth")
@@ -130,6 +168,12 @@ class ExportScene:
     def instances(self) -> dict[int, tuple[str, str]]:
         """(category, instance id) of every object, by region id."""
         return {region: name for region, name in region_names(self.row).items() if region >= REGION_FIRST_OBJECT}
+
+    @cached_property
+    def shown(self) -> tuple[str, ...]:
+        """The instances of the table, where there is one, and of every object."""
+        table = self.row["table_id"]
+        return (*(() if table is None else (table,)), *(name for _, name in self.instances.values()))
 
     def samples(self, instance_id: str) -> Mapping[str, NDArray]:
         """The shape targets of an instance by key; none where it has none. Raises CorruptError for a damaged or missing file."""

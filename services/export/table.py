@@ -33,4 +33,8 @@ FORMATS = {
     "pcn": Format("objects", "Pcn"),
     "nocs": Format("articles", "Nocs"),
     "nerf": Format("graphics", "Nerf"),
+    "zero123": Format("multiview", "Zero123"),
+    "instantmesh": Format("multiview", "InstantMesh"),
+    "trellis": Format("multiview", "Trellis"),
+    "stereo": Format("multiview", "Stereo"),
 }

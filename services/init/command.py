@@ -43,8 +43,8 @@ from workers.render.raster.gbuffer import shared_renderer
 
 SCENES = 64
 
-JOB_FILE, SHEET_FILE = "job.yaml", "sheet.jpg"
-"""Beside the table."""
+JOB_FILES, SHEET_FILE = {"tabletop": "job.yaml", "studio": "studio.yaml"}, "sheet.jpg"
+"""Beside the table; a job for each kind of scene."""
 
 MOST_MADE = 5000
 """Shapes up to which all are made at once; of more, those of the sheet: the others are made when a scene first uses them."""
@@ -74,9 +74,10 @@ assets:
   objects:
     - source: library
       folder: . # this one
-      # Objects keep their own size; `diagonal_m: 0.25` makes each as large as the article's objects are.
-      # With `copy_assets: true` the dataset holds the shapes too: see `licence` in the table.
+{sizes}      # With `copy_assets: true` the dataset holds the shapes too: see `licence` in the table.
       copy_assets: false
+"""
+TABLETOP = """\
   # What they stand on{tables}
 # Cameras stand where objects fill 6 % of the input view, or a little less than that of what is long or near. The article's
 # distances: radius_m: 2.5, T_z_m: 1.3. Depth begins nearer than by default, and a patch holds such an object.
@@ -90,6 +91,24 @@ start:
   # upright: as it stands in the pictures, at any yaw; tumbled: dropped in any rotation.
   pose: upright
 """
+STUDIO = """\
+# Each object alone on nothing, as it stands in the pictures; all are the same size. `scale: metric` keeps their own.
+scene: studio
+studio:
+  scale: unit_sphere
+  light: even
+  background: transparent
+cameras:
+  sensor: {{width: 512, height: 512, fx: 560, fy: 560, cx: 256, cy: 256}}
+  more:
+    - name: around
+      ring: {{count: 24, inclination_rad: 0.35, radius_m: fit}}
+    # The cameras of a published method: zero123, syncdreamer, zero123plus, lrm or trellis.
+    # - {{name: train, preset: zero123}}
+targets:
+  views: [normals]
+"""
+SIZES = "      # Objects keep their own size; `diagonal_m: 0.25` makes each as large as the article's objects are.\n"
 BUILT_IN_TABLES = ": tables made from a seed.\n  tables:\n    - source: procedural\n"
 OWN_TABLES = ": the library's own tables.\n  tables:\n    - source: library\n      folder: .\n"
 
@@ -109,7 +128,7 @@ def main(options: argparse.Namespace) -> int:
 def _init(options: argparse.Namespace, folder: Path, out: Path, making: Making) -> int:
     """Makes the library and all that lies beside it, and tells of it."""
     with show_counts("meshes") as watch:
-        library = fill_library(remake_library(folder, out, making, watch), watch)
+        library = fill_library(remake_library(folder, out, making, watch), watch, options.scene == "tabletop")
     used = [row for row in library.rows if row.use and row.category]
     left_out = sorted(
         (row for row in library.rows if row not in used), key=lambda row: (row.reason in (PART, COPY), row.path)
@@ -123,16 +142,17 @@ def _init(options: argparse.Namespace, folder: Path, out: Path, making: Making) 
         )
     print("\n".join([*draw_table([cells_of(row) for row in used], width), *draw_left_out(left_out, width)]))
     title = f"{folder}: {plural(len(used), 'object')}"
-    asked = ask_about_large(used)
+    asked = ask_about_large(used) if options.scene == "tabletop" else []
+    job = out / JOB_FILES[options.scene]
     notes = [*asked, *draw_left_out(left_out, None)]
     sheet = out / SHEET_FILE if _draw(out / SHEET_FILE, title, library, used, notes) else None
     categories = sorted({row.category for row in used} - {TABLE})
-    _write_job(out, folder, used)
+    _write_job(job, options.scene, folder, used)
     print(f"{out}: {plural(len(used), 'object')} in {plural(len(categories), 'category')}")
-    print("\n".join(f"  {line}" for line in (*describe_decisions(used), *asked)))
+    print("\n".join(f"  {line}" for line in (*describe_decisions(used), *library.plain, *asked)))
     look = f"  look at {sheet}, and change in {out / TABLE_FILE} what is wrong; then" if sheet else "  then"
-    print(look, command_line("run", out / JOB_FILE, "--scenes", 8))
-    tree = {"library": str(out), "job": str(out / JOB_FILE), "sheet": sheet and str(sheet), "categories": categories}
+    print(look, command_line("run", job, "--scenes", 8))
+    tree = {"library": str(out), "job": str(job), "sheet": sheet and str(sheet), "categories": categories}
     return finish(options, True, **tree, objects=list(map(_plain, used)), left_out=list(map(_plain, left_out)))
 
 
@@ -159,8 +179,11 @@ def read_making(options: argparse.Namespace) -> Making:
     return Making(by, tuple(options.unit), options.up, options.licence, limits)
 
 
-def fill_library(library: Library, watch: Watch) -> Library:
-    """The library with its shapes made, all or of a large one those of the sheet, and its table written again."""
+def fill_library(library: Library, watch: Watch, falls: bool = True) -> Library:
+    """The library with its shapes made, all or of a large one those of the sheet, and its table written again.
+
+    falls: whether convex parts are cut, which things that fall need.
+    """
     used = [row for row in library.rows if row.use and row.category]
     asked = used if len(used) <= MOST_MADE else used[:MOST]
     made = dict[str, Row]()
@@ -170,7 +193,7 @@ def fill_library(library: Library, watch: Watch) -> Library:
             raise AssetSourceError(shape.detail)
         made[row.path] = with_shape(library, row, shape)
     shown = [row for row in (made.get(row.path, row) for row in used) if row.use][:MOST]
-    counts = _count_parts(library, [row for row in shown if row.category != TABLE])
+    counts = _count_parts(library, [row for row in shown if falls and row.category != TABLE])
     numbers = {row.path: k for k, row in enumerate(shown, 1)}
     filled = (made.get(row.path, row) for row in library.rows)
     rows = tuple(replace(row, picture=numbers.get(row.path), parts=counts.get(row.path)) for row in filled)
@@ -186,19 +209,21 @@ def _count_parts(library: Library, rows: Sequence[Row]) -> dict[str, int]:
     return {cut.row.path: count for cut, count, _ in cut_shapes(cuts) if count}
 
 
-def _write_job(out: Path, folder: Path, used: Sequence[Row]) -> None:
-    """Writes the job beside the table, unless there is one, which a person may have changed."""
+def _write_job(job: Path, scene: str, folder: Path, used: Sequence[Row]) -> None:
+    """Writes the job of this kind of scene beside the table, unless there is one, which a person may have changed."""
     counts = Counter(row.category for row in used)
     tables = counts.pop(TABLE, 0)
-    if (out / JOB_FILE).exists() or not counts:
+    if job.exists() or not counts:
         return
-    text = HEAD.format(
+    on_table = scene == "tabletop"
+    text = (HEAD + (TABLETOP if on_table else STUDIO)).format(
         objects=plural(counts.total(), "object"),
         categories=plural(len(counts), "category"),
         folder=_comment(str(folder)),
         sheet=SHEET_FILE,
-        job=_comment(str(out / JOB_FILE)),
-        name=dataset_name(folder),
+        job=_comment(str(job)),
+        name=dataset_name(folder) + ("" if on_table else "_studio"),
+        sizes=SIZES if on_table else "",
         scenes=SCENES,
         weights="\n".join(
             f"  {_quoted(category)}: 1 # {plural(count, 'file')}" for category, count in sorted(counts.items())
@@ -206,7 +231,7 @@ def _write_job(out: Path, folder: Path, used: Sequence[Row]) -> None:
         tables=OWN_TABLES if tables else BUILT_IN_TABLES,
     )
     validate_job(parse_yaml(text, MOST_KEYS), "the new job")
-    write_whole(out / JOB_FILE, text.encode())
+    write_whole(job, text.encode())
 
 
 def _quoted(text: str) -> str:

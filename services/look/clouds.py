@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from schemas.base import Array
+from schemas.base import Array, Pose
 from schemas.errors import VersoError
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
 from services.dataset.dataset import Dataset
@@ -32,8 +32,14 @@ REACH_M = 1.4
 QUANTUM_M = 2e-4
 """Points are packed as whole multiples of this, relative to the target: they reach 6.5 m."""
 
+MOST_CAMERAS = 200
+"""Named cameras of a scene that are drawn."""
+
 MOST_FACES = 120_000
 """A mesh with more is drawn with its corners moved to a grid."""
+
+NEAR_M, FARTHER = 0.95, 2.6
+"""Distance, metres, from which a scene is seen first, or so many times the longest side of an object, where that is more."""
 
 GRID_STEPS = 160
 """Cells of that grid along the longest side of the mesh."""
@@ -76,6 +82,14 @@ class Space:
     bodies: tuple[Body, ...]
     missing: str
     """A sentence that says why there is no mesh; empty where there is one."""
+    cameras: Sequence[Pose] = ()
+    """`T_world_cam` [4, 4] of those that the job names."""
+
+    @property
+    def size_m(self) -> float:
+        """The longest side of the box about the objects' meshes, metres; 0 without one."""
+        objects = [body.vertices for body in self.bodies if body.kind == "object"]
+        return float(np.ptp(np.concatenate(objects), axis=0).max()) if objects else 0.0
 
 
 def read_spaces(store: Store, scene_ids: Sequence[int]) -> tuple[Space, ...]:
@@ -91,7 +105,9 @@ def read_space(store: Store, scene_id: int, most_points: int = MOST_POINTS) -> S
         target = np.mean([pose[:3, 3] for region, pose in pair.T_world.items() if region > REGION_TABLE], axis=0)
         views = (pair.views[role] for role in SHOWN_ROLES if role in pair.views)
         clouds = tuple(cloud_of(view, target, most_points) for view in views)
-        return Space(scene_id, pair.category, target, clouds, *_read_bodies(store, scene_id))
+        named = [view.T_world_cam for view in pair.views.values() if view.number is not None]
+        cameras = [named[place] for place in spread_evenly(len(named), MOST_CAMERAS)]
+        return Space(scene_id, pair.category, target, clouds, *_read_bodies(store, scene_id), cameras)
     return None
 
 
@@ -154,7 +170,7 @@ def _packed(space: Space) -> dict[str, Any]:
             "points": _base64(np.clip(np.round((cloud.points - space.target) / QUANTUM_M), -32767, 32767), "<i2"),
             "colors": _base64(cloud.colors, "u1"),
             "size": round(cloud.size_m, 6),
-            "camera": [round(float(x), 6) for x in cloud.T_world_cam.ravel()],
+            "camera": _rounded(cloud.T_world_cam),
         }
         for cloud in space.clouds
     ]
@@ -169,10 +185,16 @@ def _packed(space: Space) -> dict[str, Any]:
     return {
         "scene": space.scene_id,
         "quantum": QUANTUM_M,
-        "target": [round(float(x), 6) for x in space.target],
+        "target": _rounded(space.target),
+        "far": max(NEAR_M, FARTHER * space.size_m),
+        "cameras": list(map(_rounded, space.cameras)),
         "clouds": clouds,
         "bodies": bodies,
     }
+
+
+def _rounded(values: Array) -> list[float]:
+    return [round(float(x), 6) for x in values.ravel()]
 
 
 def _base64(values: NDArray, kind: str) -> str:

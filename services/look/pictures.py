@@ -19,6 +19,7 @@ from schemas.scene.view import MODALITIES, PixelKind
 from services.dataset.dataset import Dataset
 from services.dataset.pair import Pair
 from services.dataset.view import Pixels
+from services.dataset.views import NamedViews
 from services.look.charts import DEPTH_M, Histogram
 from services.read.dataset_reader import StoredTables
 from services.read.query import query
@@ -48,6 +49,18 @@ SHOWN_ROLES = ("input", "mirror")
 PATCH, ABOUT = " patch", "patch about the object"
 """Ends the name of a patch's picture, and the words for it."""
 
+CHEQUERS, CHEQUERED = (114, 126), 16
+"""The greys behind transparent pictures, from which white, grey and black things differ, and how many squares are in a row."""
+
+STRIP_WIDTH, STRIP_COLUMNS, STRIP_ROWS, GAP = 960, 6, 2, 2
+"""Of a strip of a named camera's views: pixels, how many views stand beside and below one another at most, pixels between."""
+
+TURNED_WIDTH, MOST_TURNED, ROUND_MS = 280, 60, 4000
+"""Of a turning picture: pixels, views at most, and milliseconds that one round takes."""
+
+MOST_STEP_RAD, FEWEST_TURNED = 1.6, 4
+"""Views whose optical axes turn by at most this from each to the next, so many at least, go round."""
+
 PLAIN = tuple(name for name, modality in MODALITIES.items() if modality.target is None)
 """Modalities that are no targets."""
 
@@ -58,7 +71,7 @@ class Picture:
 
     data: bytes
     kind: str
-    """`jpeg` or `png`."""
+    """`jpeg`, `png` or `webp`."""
     width: int
     height: int
     words: str
@@ -127,10 +140,8 @@ def picture_of_codes(codes: NDArray[np.uint16], words: str) -> Picture:
 def picture_of_silhouettes(masks: Sequence[NDArray[np.uint8]], under: NDArray[np.uint8], words: str) -> Picture:
     """The outline of each object's mask [H, W] in the object's colour, over an image [H, W, 3] of RGB."""
     shown = under.copy()
-    # A line of one pixel would vanish where the picture is shrunk.
-    size = 3 + 2 * ((under.shape[1] - 1) // MOST_WIDTH)
     for mask, color in zip(masks, cycle(OBJECT_REGIONS)):
-        inner = np.asarray(Image.fromarray(mask).filter(ImageFilter.MinFilter(size)))
+        inner = np.asarray(Image.fromarray(mask).filter(ImageFilter.MinFilter(3)))
         shown[mask > inner] = color
     return _jpeg(Image.fromarray(shown), words, subsampling=0)  # thin lines keep their colour
 
@@ -143,16 +154,12 @@ def picture_of_projection(mirror: NDArray[np.uint8], projected: NDArray[np.uint8
 
 
 def _jpeg(image: Image.Image, words: str, subsampling: int = 2) -> Picture:
-    size = _size_of(image)
-    if size != image.size:
-        image = image.resize(size, Image.Resampling.BOX)
     sink = io.BytesIO()
     image.save(sink, "JPEG", quality=JPEG_QUALITY, optimize=True, subsampling=subsampling)
-    return Picture(sink.getvalue(), "jpeg", *size, words)
+    return Picture(sink.getvalue(), "jpeg", image.width, image.height, words)
 
 
 def _png(image: Image.Image, words: str, palette: Sequence[int] = ()) -> Picture:
-    image = image.resize(_size_of(image), Image.Resampling.NEAREST)
     if palette:
         image.putpalette(palette)
     sink = io.BytesIO()
@@ -160,14 +167,44 @@ def _png(image: Image.Image, words: str, palette: Sequence[int] = ()) -> Picture
     return Picture(sink.getvalue(), "png", image.width, image.height, words)
 
 
-def _size_of(image: Image.Image) -> tuple[int, int]:
-    width = min(image.width, MOST_WIDTH)
-    return width, max(1, round(image.height * width / image.width))
+def flatten(pixels: NDArray) -> NDArray:
+    """Colours with alpha [H, W, 4] over grey chequers, as RGB [H, W, 3]; any other image as it is."""
+    if pixels.ndim < 3 or pixels.shape[2] < 4:
+        return pixels
+    rows, columns = np.indices(pixels.shape[:2]) * CHEQUERED // pixels.shape[1]
+    ground = np.take(CHEQUERS, (rows + columns) % 2)[..., None]
+    return np.rint(ground + (pixels[..., :3] - ground) * (pixels[..., 3:] / 255.0)).astype(np.uint8)
+
+
+def shrink(pixels: NDArray, width: int = MOST_WIDTH) -> NDArray:
+    """An image at most so many pixels wide: colours are averaged, of depths, regions and codes some are left out."""
+    if pixels.shape[1] <= width:
+        return pixels
+    height = max(1, round(pixels.shape[0] * width / pixels.shape[1]))
+    if pixels.ndim == 3 and pixels.dtype == np.uint8:
+        return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
+    rows, columns = (np.arange(n) * whole // n for n, whole in zip((height, width), pixels.shape[:2], strict=True))
+    return pixels[rows[:, None], columns]
 
 
 def _palette() -> list[int]:
     objects = np.resize(np.array(OBJECT_REGIONS), (256 - REGION_FIRST_OBJECT, 3))
     return [int(value) for value in np.concatenate([np.array(FIXED_REGIONS), objects]).ravel()]
+
+
+@dataclass(frozen=True)
+class ShownCamera:
+    """The views of a camera that the job names."""
+
+    name: str
+    views: int
+    """How many there are."""
+    shown: int
+    """How many of them the strips have, evenly chosen."""
+    strips: Mapping[str, Picture]
+    """Views beside and below one another, by name (`around rgb`)."""
+    turning: Picture | None
+    """One after another, where they go round step by step."""
 
 
 @dataclass(frozen=True)
@@ -182,6 +219,8 @@ class ShownScene:
     visible: Mapping[str, float | None]
     """Visible fraction of the object by role."""
     d_z_m: float | None
+    cameras: Sequence[ShownCamera] = ()
+    """Those that the job names."""
 
 
 def choose_scenes(tables: StoredTables, scenes: int) -> list[int]:
@@ -217,7 +256,8 @@ def show_pair(pair: Pair, depth: dict[str, Histogram], kinds: Collection[PixelKi
             depth[role] = depth[role].add(whole["depth"][of_objects] / units_per_m)
     if pair.mirror is not None and pair.projected is not None and "rgb" in pair.projected.images:
         over = "input view projected over the mirror view"
-        pictures["over"] = picture_of_projection(pair.mirror.rgb(), pair.projected.rgb(), over)
+        pictures["over"] = picture_of_projection(shrink(pair.mirror.rgb()), shrink(pair.projected.rgb()), over)
+    names = dict.fromkeys(view.role for view in pair.views.values() if view.number is not None)
     return ShownScene(
         pair.scene_id,
         pair.category,
@@ -226,18 +266,63 @@ def show_pair(pair: Pair, depth: dict[str, Histogram], kinds: Collection[PixelKi
         pictures,
         {role: pair.views[role].visible_fraction for role in SHOWN_ROLES if role in pair.views},
         pair.input.d_z_m,
+        [show_camera(pair.views(name), kinds) for name in names],
     )
 
 
+def show_camera(views: NamedViews, kinds: Collection[PixelKind] | None = None) -> ShownCamera:
+    """The pictures of a named camera, of these modalities or of all."""
+    count = min(len(views), STRIP_ROWS * STRIP_COLUMNS)
+    columns = min(count // 2, STRIP_COLUMNS) if count > STRIP_COLUMNS else count
+    chosen = [views[place] for place in spread_evenly(len(views), count - count % columns)]
+    read = [_read_images(view, kinds) for view in chosen]
+    tile = min(MOST_WIDTH, STRIP_WIDTH // columns - GAP)
+    strips = {kind: _tiled([shrink(images[kind], tile) for images in read], columns) for kind in read[0]}
+    name, units_per_m = chosen[0].role, chosen[0].depth_units_per_m
+    return ShownCamera(
+        name, len(views), len(chosen), view_pictures(name, strips, units_per_m, width=STRIP_WIDTH), _turning(views)
+    )
+
+
+def _tiled(images: Sequence[NDArray], columns: int) -> NDArray:
+    """Images beside and below one another, in rows of so many; 0 between them and beside smaller ones."""
+    height, width = (max(sizes) + GAP for sizes in zip(*(image.shape[:2] for image in images), strict=True))
+    tiled = np.zeros((height * (len(images) // columns), width * columns, *images[0].shape[2:]), images[0].dtype)
+    for place, image in enumerate(images):
+        top, left = height * (place // columns), width * (place % columns)
+        tiled[top : top + image.shape[0], left : left + image.shape[1]] = image
+    return tiled
+
+
+def _turning(views: NamedViews) -> Picture | None:
+    """The views one after another as a WebP that moves; None where they do not go round, step by step, and without RGB."""
+    axes = views.T_world_cam[:, :3, 2]
+    steps = np.arccos(np.clip(np.einsum("ij,ij->i", axes, np.roll(axes, -1, axis=0)), -1.0, 1.0))
+    if len(axes) < FEWEST_TURNED or steps.max() > MOST_STEP_RAD or "rgb" not in views[0].images:
+        return None
+    chosen = [views[place].image("rgb") for place in spread_evenly(len(views), MOST_TURNED)]
+    first, *others = (Image.fromarray(shrink(flatten(pixels), TURNED_WIDTH)) for pixels in chosen)
+    if any(image.size != first.size for image in others):
+        return None
+    sink, each_ms = io.BytesIO(), ROUND_MS // len(chosen)
+    first.save(sink, "WEBP", save_all=True, append_images=others, duration=each_ms, loop=0, quality=JPEG_QUALITY)
+    return Picture(sink.getvalue(), "webp", *first.size, f"{views[0].role} view, turning")
+
+
 def _read_images(pixels: Pixels, kinds: Collection[PixelKind] | None) -> dict[PixelKind, NDArray]:
-    return {kind: pixels.image(kind) for kind in pixels.images if kinds is None or kind in kinds}
+    return {kind: flatten(pixels.image(kind)) for kind in pixels.images if kinds is None or kind in kinds}
 
 
 def view_pictures(
-    role: str, images: Mapping[PixelKind, NDArray], units_per_m: float, suffix: str = ""
+    role: str, images: Mapping[PixelKind, NDArray], units_per_m: float, suffix: str = "", width: int = MOST_WIDTH
 ) -> dict[str, Picture]:
-    """The pictures of a view's images, or of its patches, by name; depths of one series have the same span of colours."""
-    there = {kind: pixels for kind in MODALITIES if (pixels := _images_of(kind, images))}
+    """The pictures of a view's images, or of its patches, by name, at most so many pixels wide.
+
+    Depths of one series have the same span of colours.
+    """
+    there = {
+        kind: [shrink(each, width) for each in pixels] for kind in MODALITIES if (pixels := _images_of(kind, images))
+    }
     pictures = {}
     for kinds in series_of(there).values():
         span = _span_of(kinds, there, units_per_m)

@@ -30,7 +30,8 @@ def space_html(spaces: Sequence[Space], data: str) -> str:
         f"{escape(space.category)}, scene {space.scene_id}</option>"
         for at, space in enumerate(spaces)
     )
-    about = "The stored depth of both cameras as points, with the mesh as it was posed."
+    whose = "both cameras" if len(roles) > 1 else "the camera"
+    about = f"The stored depth of {whose} as points, with the mesh as it was posed."
     keys = "Arrow keys turn, plus and minus zoom, 0 resets."
     return (
         f'<p class="sub">{about}<span id="space-missing">{escape(spaces[0].missing)}</span></p>'
@@ -50,7 +51,9 @@ def overview_html(
     tiles = [
         ("scenes", f"{figures.scenes:,}", f"of {job.scenes:,} asked"),
         ("failed", f"{failed:,}", f"{number(round(100 * failed / max(failed + figures.scenes, 1), 2))} % of those tried"),
-        ("pairs of views", f"{figures.pairs:,}", plural(figures.views, 'view')),
+        ("pairs of views", f"{figures.pairs:,}", plural(figures.views, 'view'))
+        if job.cameras.mirror.enabled
+        else ("views", f"{figures.views:,}", f"of {plural(figures.scenes, 'scene')}"),
         ("objects", f"{figures.instances:,}", f"different ones in {plural(len(figures.by_category), 'category')}"),
         ("images", f"{figures.files:,}", size(figures.bytes / 1e3)),
         ("time", describe_seconds(figures.seconds), f"{milliseconds(1e3 * figures.seconds / max(figures.scenes, 1))} a scene"),
@@ -89,7 +92,7 @@ def charts_html(figures: Figures, depth: Mapping[str, Histogram]) -> str:
         Chart(
             "Distance to the object",
             {"": figures.distance},
-            "d_z of each pair, which places the mirror camera.",
+            "d_z of each input view.",
             metres,
         ),
         Chart(

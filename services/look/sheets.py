@@ -5,6 +5,7 @@ from html import escape
 
 import numpy as np
 
+from schemas.errors import plural
 from schemas.scene.view import MODALITIES, PixelKind
 from services.look.pictures import (
     FIXED_REGIONS,
@@ -12,6 +13,7 @@ from services.look.pictures import (
     PATCH,
     SHOWN_ROLES,
     Picture,
+    ShownCamera,
     ShownScene,
     series_of,
     viridis,
@@ -23,8 +25,8 @@ Address = Callable[[Picture], str]
 CELLS = (*(f"{role} {kind}" for role in SHOWN_ROLES for kind in ("rgb", "depth", "region")), "over")
 """Pictures that a scene has without targets, beside its patches."""
 
-STRIP = ("input rgb", "mirror rgb", "mirror depth", "mirror region")
-"""What is shown of a scene where there is little room."""
+STRIP = ("input rgb", "mirror rgb", "mirror depth", "mirror region", "input depth", "input region")
+"""What is shown of a scene where there is little room: the first four that it has."""
 
 
 def sheets_html(scenes: Sequence[ShownScene], address: Address) -> str:
@@ -54,6 +56,7 @@ def _scene_html(scene: ShownScene, address: Address) -> str:
         f'<article class="scene" data-category="{escape(scene.category)}" data-scene="{scene.scene_id}">'
         f"<header><h3>{escape(scene.category)} <span>scene {scene.scene_id}{several}</span></h3>{compare}</header>"
         f"{_targets(scene, targets, close, address) if targets else ''}{_cells('cells', scene, cells, address)}"
+        f"{''.join(_camera(scene, camera, address) for camera in scene.cameras)}"
         f'<p class="note">{escape(_facts(scene))}</p></article>\n'
     )
 
@@ -73,12 +76,27 @@ def _targets(scene: ShownScene, targets: Sequence[str], close: Sequence[str], ad
     )
 
 
+def _camera(scene: ShownScene, camera: ShownCamera, address: Address) -> str:
+    """A named camera: its views turning, in a strip, and folded up the strips of what else is stored of them."""
+    turning = _cell(scene, "turning", camera.turning, address) if camera.turning else ""
+    first, *others = (_cell(scene, name, picture, address) for name, picture in camera.strips.items())
+    some = f"{camera.shown} of " if camera.shown < camera.views else ""
+    more = f"<details><summary>What else is stored of them</summary>{''.join(others)}</details>" if others else ""
+    return (
+        f'<section class="camera"><h4>{escape(camera.name)} <span>{some}{plural(camera.views, "view")}</span></h4>'
+        f'<div>{turning}<div class="strips">{first}{more}</div></div></section>'
+    )
+
+
 def _cells(kind: str, scene: ShownScene, names: Sequence[str], address: Address) -> str:
-    return f'<div class="{kind}">{"".join(_cell(scene, name, address) for name in names)}</div>' if names else ""
+    return (
+        f'<div class="{kind}">{"".join(_cell(scene, name, scene.pictures[name], address) for name in names)}</div>'
+        if names
+        else ""
+    )
 
 
-def _cell(scene: ShownScene, name: str, address: Address) -> str:
-    picture = scene.pictures[name]
+def _cell(scene: ShownScene, name: str, picture: Picture, address: Address) -> str:
     words = f"{scene.category}, scene {scene.scene_id}: {picture.words}"
     return (
         f'<figure class="{name.replace(" ", "-")}"><img loading="lazy" decoding="async" width="{picture.width}" '
@@ -160,8 +178,10 @@ def compare_html(scenes: Sequence[ShownScene]) -> str:
 
 
 def strip_html(scene: ShownScene, address: Address) -> str:
-    """Four pictures of a scene, and its name."""
-    pictures = [scene.pictures[name] for name in STRIP if name in scene.pictures]
+    """At most four pictures of a scene, the last one of its named cameras, and its name."""
+    turning = [camera.turning for camera in scene.cameras if camera.turning]
+    plain = [scene.pictures[name] for name in STRIP if name in scene.pictures]
+    pictures = [*plain[: 4 - len(turning[:1])], *turning[:1]]
     images = "".join(
         f'<img width="{one.width}" height="{one.height}" alt="{escape(f"scene {scene.scene_id}: {one.words}")}" '
         f'src="{address(one)}">'

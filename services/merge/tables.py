@@ -244,6 +244,10 @@ def _lines(rows: pa.Table, columns: Sequence[str], separator: str) -> bytes:
 SHAPES_OF_CAPTURES = """\
 - reconstructed from the captures: the merged mesh with the licence in capture.json; what no view saw is missing
 - boards: a rectangle, CC0-1.0"""
+PAIRS = """\
+View-dependent RGB-D pairs for reconstructing objects from a single view: what a camera sees, and what the camera on the
+other side sees."""
+ALONE = "RGB-D views of single objects, each alone on nothing, from the cameras that the job names."
 SEAL = ("<!-- SHA-256 of the text above: ", " -->\n")
 """The ends of the card's last line."""
 
@@ -279,13 +283,15 @@ def describe_dataset(record: JobRecord, catalogue: "Catalogue", merged: MergeRes
     """The text of DATASET.md."""
     job, objects = record.job, record.job.objects_per_scene
     libraries = "\n".join(f"| {name} | {version} |" for name, version in sorted(fingerprint.libraries.items()))
-    sources = "\n".join(f"- {line}" for line in describe_sources(catalogue))
+    alone = job.scene == "studio"
+    sources = "\n".join(f"- {x}" for x in describe_sources(catalogue) if not (alone and x.startswith("tables")))
+    counts_of = (f"{entry.name}{'' if entry.count is None else f' ({entry.count})'}" for entry in job.cameras.more)
+    more = f"| views of further cameras | {', '.join(counts_of)} |\n" if job.cameras.more else ""
     captured = job.captures is not None
     counts = ", ".join(f"{merged.scenes[outcome]} {outcome}" for outcome in ("made", "intrinsic", "environmental"))
     return f"""# {job.name}
 
-View-dependent RGB-D pairs for reconstructing objects from a single view: what a camera sees, and what the camera on the
-other side sees. Made by Verso; the layout and the geometry follow {ARTICLE}.
+{ALONE if alone else PAIRS} Made by Verso; the layout and the geometry follow {ARTICLE}.
 
 | | |
 |---|---|
@@ -293,7 +299,7 @@ other side sees. Made by Verso; the layout and the geometry follow {ARTICLE}.
 | pairs in each scene | {"at most " * captured}{job.pairs_per_scene} |
 | objects in each scene | {objects.low}{f" to {objects.high}" * (objects.low < objects.high)} |
 | views of each pair | {", ".join(stored_roles(job))}{"" if job.render.rgb else "; without RGB"} |
-| seed | {job.seed} |
+{more}| seed | {job.seed} |
 | dataset digest | `{merged.digest}` |
 | job digest | `{record.digest}` (the job is in `{JOB_FILE}`) |
 | stack's fingerprint | `{fingerprint.digest}` |
@@ -315,12 +321,13 @@ Every shape, with its licence and its split by instance, is a row of the `assets
 
 def _describe_reading(job: Job) -> str:
     objects = "nothing, 1 floor, 2 table, 3 and up objects"
+    alpha = "Alpha is the share of a pixel that is covered; colours are not darkened by it.\n" if job.has_alpha else ""
     regions = objects if job.captures is None else "neither board nor object, 2 board, 3 object"
     return f"""## Reading it
 
 `pyarrow.dataset.dataset("manifest/views", partitioning="hive")` has a row for each camera and the names and checksums of
 its images, `manifest/objects` one for each thing that it may see; `bodies` in `manifest/scenes` says where each object lies.
-Depth is 16-bit PNG, z along the optical axis, {job.images.depth_units_per_m:g} units a metre, 0 where there is none.
+{alpha}Depth is 16-bit PNG, z along the optical axis, {job.images.depth_units_per_m:g} units a metre, 0 where there is none.
 Masks are 8-bit PNG: 0 {regions}. Poses are camera to world, optical frame (x right,
 y down, z forward), metres.
 """
@@ -352,7 +359,7 @@ MOST_LICENCES = 10
 
 
 def describe_sources(catalogue: "Catalogue") -> list[str]:
-    """One line for each source of objects and of tables with its licence, and those of `Catalogue.describe_left_out`."""
+    """One line for each source of objects and of tables with its licence, and what was left out or has no colour."""
     lines = []
     for what, sources, libraries in (
         ("objects", catalogue.assets.objects, catalogue.objects),
@@ -366,4 +373,4 @@ def describe_sources(catalogue: "Catalogue") -> list[str]:
                 most = ", ".join(f"{name} ({count})" for name, count in library.licences.most_common(MOST_LICENCES))
                 origin = f"library {source.folder}, licences {most}"
             lines.append(f"{what}, weight {source.weight:g}: {origin}")
-    return lines + catalogue.describe_left_out()
+    return [*lines, *catalogue.describe_left_out(), *catalogue.describe_plain()]

@@ -213,10 +213,11 @@ def _check_samples(arrays: Mapping[str, NDArray]) -> None:
 
 
 def region_names(scene: Mapping[str, Any]) -> dict[int, tuple[str, str]]:
-    """(category, instance id) of the table and of every object, by region id, of a row of `scenes`."""
+    """(category, instance id) of the table, where there is one, and of every object, by region id, of a row of `scenes`."""
     bodies = scene["bodies"] or [{**scene, "region_id": REGION_FIRST_OBJECT}]
     objects = {body["region_id"]: (body["category"], body["instance_id"]) for body in bodies}
-    return {REGION_TABLE: (TABLE, scene["table_id"]), **objects}
+    table = {} if scene["table_id"] is None else {REGION_TABLE: (TABLE, scene["table_id"])}
+    return table | objects
 
 
 def view_paths(row: Mapping[str, Any]) -> Mapping[PixelKind, str]:

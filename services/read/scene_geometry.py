@@ -50,6 +50,7 @@ class Sources:
             from workers.assets.catalogue import load_asset
             from workers.scene.chance import SceneChance
             from workers.scene.plan import choose_assets
+            from workers.scene.studio import scaled_to
         catalogue = self._opened
         if isinstance(catalogue, InputError):
             raise InputError(f"{missing} its source cannot be read here: {catalogue}") from catalogue
@@ -63,7 +64,8 @@ class Sources:
             raise CorruptError(
                 f"scene {scene_id} of the job has no {category} {instance_id}: restore job.yaml from a copy"
             )
-        return load_asset(catalogue, ref)
+        asset, job = load_asset(catalogue, ref), self._record.job
+        return scaled_to(asset, job.studio) if job.scene == "studio" else asset
 
     @cached_property
     def _opened(self) -> "Catalogue | VersoError | OSError":
@@ -111,7 +113,10 @@ def read_meshes(read: ReadShape, sources: Sources, scene_id: int, name: tuple[st
 
 
 def posed_scene(store: Store, scene_id: int) -> trimesh.Scene:
-    """Floor, table or board, and objects where the stored rows put them. Raises InputError where the scene was not made."""
+    """Floor, table or board, as far as there are, and objects where the stored rows put them.
+
+    Raises InputError where the scene was not made.
+    """
     record, stored = require_job(store), find_scene(store, scene_id)
     row = stored.scene(scene_id)
     if row is None:
@@ -129,11 +134,11 @@ def pose_shapes(store: Store, stored: StoredRange, row: Row, record: JobRecord, 
     placed: list[tuple[str, int, list[Named]]] = []
     if record.job.captures is not None:
         placed.append((f"board {names.pop(REGION_TABLE)[1]}", REGION_TABLE, [("board", _board(stored, row))]))
-    else:
+    elif REGION_TABLE in names:
         placed.append(("floor", REGION_FLOOR, _floor(record, row["scene_id"])))
     for region_id, of in names.items():
         # Two objects may be of one instance: only the region id tells them apart.
-        region = f" {region_id}" if len(names) > 2 and region_id >= REGION_FIRST_OBJECT else ""
+        region = f" {region_id}" if len(T_world) > 3 and region_id >= REGION_FIRST_OBJECT else ""
         placed.append((f"{' '.join(of)}{region}", region_id, read_meshes(store.read, sources, row["scene_id"], of)))
     for label, region_id, meshes in placed:
         for number, (name, mesh) in enumerate(meshes):

@@ -85,7 +85,7 @@ def cut_shapes(cuts: Iterable[Cut], folder: Path | None = USUAL_FOLDER) -> Itera
     A shape is cut once for ever. Raises MachineError where a process is killed.
     """
     asked, kept = list(cuts), Answers(folder and folder / "cut")
-    with show_counts("meshes", "mesh") as watch:
+    with show_counts("meshes", "shape") as watch:
         for done, (cut, answer) in enumerate(run_pool(cut_shape, asked, key=lambda cut: cut.key, kept=kept), 1):
             watch("cut into convex parts", done, len(asked))
             if not isinstance(answer, Ended):

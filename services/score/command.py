@@ -6,6 +6,7 @@ The page is one HTML file that needs nothing beside it: the answer first, then t
 import argparse
 import json
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -26,7 +27,7 @@ from services.look.report import Page, Section, whole_page
 from services.look.sections import table_html
 from services.read.verdict import explain_damage
 from services.run.progress import finish
-from services.score.items import LEVELS, Asked
+from services.score.items import Asked
 from services.score.predictions import find_predictions
 from services.score.run import KEPT, describe_refused, score_dataset
 from services.score.summary import (
@@ -62,7 +63,8 @@ def main(options: argparse.Namespace) -> int:
             "name the folder of predictions: verso score OUT PREDICTIONS, or --compare A B for two that are scored"
         )
     given = find_predictions(options.predictions)
-    asked = _asked(given.kinds, options, align=options.align, flip=options.flip)
+    chosen = options.split, options.level, options.volume
+    asked = Asked(given.kinds, options.frame, *chosen, align=options.align, flip=options.flip)
     target = options.score or options.predictions / "score"
     with explain_damage(store), alone_in(target, KEPT, "verso score"):
         digest = (read_success(store) or {}).get("digest")  # before: it may be extended meanwhile
@@ -91,19 +93,11 @@ def main(options: argparse.Namespace) -> int:
     return finish(options, is_whole(summary), **answer, page=str(target / PAGE_FILE))
 
 
-def _asked(kinds: tuple[str, ...], options: argparse.Namespace, **more: Any) -> Asked:
-    """What both commands ask alike. Raises InputError where a level is not of the split that is named beside it."""
-    split = options.split if options.level == "all" else LEVELS[options.level][0]
-    if options.split not in ("all", split):
-        raise InputError(f"level {options.level} is of the split {split}: leave --split {options.split} out")
-    return Asked(kinds, options.frame, split=split, level=options.level, volume=options.volume, **more)
-
-
 def check(options: argparse.Namespace) -> int:
     """Says by kind how many items are there and can be read, and what cannot and why; 0 where all of the split can be scored."""
     store = require_dataset(open_store(options.out))
     given = find_predictions(options.predictions)
-    asked = _asked(given.kinds, options, check=True)
+    asked = Asked(given.kinds, options.frame, options.split, options.level, options.volume, check=True)
     with explain_damage(store), tempfile.TemporaryDirectory() as scratch:
         path = score_dataset(store, given, asked, Path(scratch))
         summary, troubles = summarise(pq.read_table(path)), describe_refused(path)
@@ -205,8 +199,29 @@ _HIDDEN_BY: Final = {
 
 _UNITS: Final = {"_m": (1e3, "mm"), "_m2": (1e6, "mm²"), "_deg": (1.0, "°"), "_px": (1.0, "px"), "_db": (1.0, "dB")}
 
+_ACRONYMS: Final = (
+    "auc",
+    "mae",
+    "rmse",
+    "rgb",
+    "ncc",
+    "psnr",
+    "ssim",
+    "ms",
+    "flip",
+    "l1",
+    "l2",
+    "add",
+    "s",
+    "mssd",
+    "mspd",
+)
+_WORDS: Final = {word: word.upper() for word in _ACRONYMS} | {"iou": "IoU", "fscore": "F-score", "1pct": "1 %"}
+"""What is not written as in the names of columns."""
+
 _STYLE: Final = (
-    "table, pre { display: block; overflow-x: auto; } table { margin-bottom: 1rem; } details { margin: 0 0 2rem; }"
+    "table, pre { display: block; overflow-x: auto; } table { margin-bottom: 1rem; } details { margin: 0 0 2rem; } "
+    "@media (max-width: 44rem) { th code { display: none; } }"
 )
 
 
@@ -219,8 +234,12 @@ def in_words(name: str, value: float | int | None) -> str:
 
 
 def interval(name: str, figure: Figure) -> str:
-    """`low to high`; empty where there is none."""
-    return "" if figure["low"] is None else f"{in_words(name, figure['low'])} to {in_words(name, figure['high'])}"
+    """`279 to 309 mm`; empty where there is none."""
+    if figure["low"] is None:
+        return ""
+    low, high = (in_words(name, figure[end]) for end in ("low", "high"))
+    unit = _UNITS.get(name[name.rfind("_") :], (1.0, ""))[1]
+    return f"{low.removesuffix(unit).rstrip()} to {high}"
 
 
 def covered(figure: Figure) -> str:
@@ -230,13 +249,14 @@ def covered(figure: Figure) -> str:
 
 
 def words(name: str) -> str:
-    """The name of a metric for readers: `depth mae hidden`."""
-    return name.removesuffix("_m").removesuffix("_deg").removesuffix("_db").replace("_", " ")
+    """The name of a metric for readers: `depth MAE hidden`."""
+    parts = re.sub("_(m2?|deg|db|px)$", "", name).split("_")
+    return re.sub(r"(\d)mm", r"\1 mm", " ".join(_WORDS.get(part, part) for part in parts))
 
 
 def answer_of(summary: Mapping[str, Any]) -> str:
     """One line with the first metric of every kind, and the numbers of items."""
-    numbers = ", ".join(f"{summary[word]} {word}" for word in ("scored", "missing", "refused"))
+    numbers = ", ".join(f"{summary[word]:,} {word}" for word in ("scored", "missing", "refused"))
     lines = []
     for name in SHOWN:
         if figure := summary["metrics"].get(name):
@@ -251,8 +271,8 @@ def page_of(summary: Mapping[str, Any], table: pa.Table, troubles: Sequence[str]
     items = "".join(f"<li>{escape(line)}</li>" for line in troubles)
     answer = f'<p class="lead">{escape(answer_of(summary))}</p><ul class="troubles">{items}</ul>'
     note = (
-        "Means over all items of the split, 95 % intervals by a bootstrap over scenes. What is missing, refused or a hole counts "
-        "as worst. "
+        "Means over all items of the split, and below them 95 % intervals by a bootstrap over scenes. What is missing, refused "
+        "or a hole counts as worst. "
         "Seen and hidden: the object's pixels whose surface the input view sees, and does not, "
         f"{_HIDDEN_BY[summary['hidden_by']]}. "
         f"The queries make the numbers of each table, in metres, from {ITEMS_FILE} in the folder of this page, with DuckDB; the "
@@ -267,7 +287,7 @@ def page_of(summary: Mapping[str, Any], table: pa.Table, troubles: Sequence[str]
     ]
     page = Page(
         f"Score of {Path(summary['predictions']).name}",
-        f"Against {summary['dataset']}; alignment: {summary['align']}",
+        f"Against {summary['dataset']}; " + ", ".join(f"{key}: {summary[key]}" for key in ("split", "level", "align")),
         sections,
         "",
     )
@@ -278,20 +298,23 @@ def _query_html(sql: str) -> str:
     return f"<details><summary>Query</summary><pre><code>{escape(sql)}</code></pre></details>"
 
 
+def _with_interval(name: str, figure: Figure) -> str:
+    return f"{in_words(name, figure['value'])}<small>{interval(name, figure)}</small>"
+
+
 def _metrics(metrics: Mapping[str, Figure], columns: Sequence[str]) -> str:
     rows = {
         name: (
             f"{words(name)}<small><code>{name}</code></small>",
-            in_words(name, figure["value"]),
+            _with_interval(name, figure),
             covered(figure).removeprefix("coverage "),
-            interval(name, figure) or "–",
             in_words(name, figure["worst"]),
-            str(figure["items"]),
+            f"{figure['items']:,}",
         )
         for name, figure in metrics.items()
         if figure["items"]
     }
-    head = ("metric", "mean", "coverage", "95 % interval", "at worst", "items")
+    head = ("metric", "mean", "coverage", "at worst", "items")
     first, rest = (
         table_html(head, [rows[name] for name in names]) + _query_html(query_of(names, columns)) if names else ""
         for names in ([name for name in rows if (name in HEADLINES) == is_first] for is_first in (True, False))
@@ -302,13 +325,7 @@ def _metrics(metrics: Mapping[str, Figure], columns: Sequence[str]) -> str:
 
 def _group(title: str, groups: Mapping[str, Mapping[str, Figure]], columns: Sequence[str]) -> str:
     names = [name for name in SHOWN if any(group.get(name, {}).get("items") for group in groups.values())]
-    rows = [
-        (
-            escape(word),
-            *(f"{in_words(name, group[name]['value'])}<small>{interval(name, group[name])}</small>" for name in names),
-        )
-        for word, group in groups.items()
-    ]
+    rows = [(escape(word), *(_with_interval(name, group[name]) for name in names)) for word, group in groups.items()]
     if not names:
         return ""
     table = table_html((title.replace("_", " "), *map(words, names)), rows)

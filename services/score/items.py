@@ -13,6 +13,7 @@ all with depth; `image`, all. The scene's floor and table are not in `seen` and 
 and they would drown it.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -34,7 +35,7 @@ from services.dataset.pair import Pair, carry
 from services.dataset.view import View
 from services.score.images import Alignment, align_depth, score_colour, score_depth
 from services.score.pose import INVERTED, box_of, check_distance, correlation, score_pose, score_volume, symmetries_of
-from services.score.predictions import Key, read_array, read_image, read_pose, read_shape
+from services.score.predictions import Key, file_in, read_array, read_image, read_pose, read_shape
 from workers.door.opening import as_refusal
 from workers.geometry.frames import invert, transform
 
@@ -81,19 +82,27 @@ class Asked:
 
     kinds: tuple[str, ...]
     frame: PredictedFrame = "object"
-    samples: int = 10_000
-    """Points drawn on a surface."""
-    seed: int = 0
-    align: Alignment = "none"
     split: Split | Literal["all"] = "all"
     """Which scenes are scored: all, or those whose objects all are of instances of one split."""
     level: str = "all"
     """Which of them: those of a level of `LEVELS`, whose split `split` is then."""
     volume: Volume = "auto"
+    samples: int = 10_000
+    """Points drawn on a surface."""
+    seed: int = 0
+    align: Alignment = "none"
     check: bool = False
     """Whether predictions are read and held against units, sizes and places alone, and not scored but for holes."""
     flip: bool = False
     """Whether FLIP is among the metrics of RGB: it takes 0.7 s an image of 640 x 480."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError where a level is not of the split that is named beside it."""
+        if self.level != "all":
+            split = LEVELS[self.level][0]
+            if self.split not in ("all", split):
+                raise InputError(f"level {self.level} is of the split {split}: leave --split {self.split} out")
+            object.__setattr__(self, "split", split)
 
 
 def column(kind: str, name: str) -> str:
@@ -157,7 +166,7 @@ def _score(kind: str, names: tuple[str, ...], region: int, truth: "Truth", folde
             where = f"{len(names)} lines of poses.csv" if kind == "pose" else ", ".join(names)
             raise InputError(f"the id is there {len(names)} times: {where}")
         with as_refusal(f"{kind} {names[0]}"):
-            prediction = folder / kind / names[0] if kind != "pose" else names[0]
+            prediction = file_in(folder, f"{kind}/{names[0]}") if kind != "pose" else names[0]
             scorer = _READERS[kind](prediction, region, prepared, truth, asked)
             scores, note = scorer() if kind == "depth" or not asked.check else ({}, None)
     except VersoError as error:
@@ -377,7 +386,7 @@ def _read_pose(text: str, region: int, prepared: Any, truth: Truth, asked: Asked
     view = truth.pair.input if asked.frame == "input" else truth.view
     T_true = read_matrix(view.regions[region]["T_cam_obj"])
     T = read_pose(text)
-    off_m, away_m = float(np.linalg.norm(T[:3, 3])), float(np.linalg.norm(T_true[:3, 3]))
+    off_m, away_m = math.hypot(*T[:3, 3]), math.hypot(*T_true[:3, 3])  # which does not overflow
     if not 1e-2 < off_m / away_m < 1e2:
         raise InputError(f"t is {off_m / away_m:.4g} times as far as the object: BOP's csv has millimetres")
     return lambda: (score_pose(T, T_true, prepared.vertices, symmetries_of(prepared), view.K), None)

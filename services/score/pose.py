@@ -124,6 +124,8 @@ def is_rigid(T: Pose) -> bool:
     if T.shape != (4, 4) or not np.isfinite(T).all():
         return False
     R = T[:3, :3]
+    if np.abs(R).max() > 1.0 + ROTATION:  # its products may overflow
+        return False
     return bool(np.abs(R @ R.T - np.eye(3)).max() <= ROTATION and np.linalg.det(R) > 0.0)
 
 

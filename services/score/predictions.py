@@ -92,7 +92,7 @@ def find_predictions(folder: Path) -> Predictions:
             names[kind, int(name[1]), region].append(path.name)
     if os.path.lexists(folder / POSES_FILE):
         try:
-            for key, text in _read_poses(folder / POSES_FILE, strays):
+            for key, text in _read_poses(folder, strays):
                 names[key].append(text)
         except InputError as error:
             strays.append(("pose", str(error)))
@@ -148,7 +148,16 @@ def digest_of(folder: Path, key: Key, name: str) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def _read_poses(path: Path, strays: list[tuple[str, str]]) -> Iterator[tuple[Key, str]]:
+def file_in(folder: Path, name: str) -> Path:
+    """The path of a file of the folder. Raises InputError where a link leads out of it: to the truth, or to another's files."""
+    path = folder / name
+    if not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder)):
+        raise InputError(f"{plain_line(name)} is a link out of {folder}: put the file itself there")
+    return path
+
+
+def _read_poses(folder: Path, strays: list[tuple[str, str]]) -> Iterator[tuple[Key, str]]:
+    path = file_in(folder, POSES_FILE)
     data = read_bytes(path, MOST_BYTES)
     with as_refusal(path, remedy="write it as CSV"):
         reader = csv.DictReader(io.StringIO(data.decode("utf-8-sig")))

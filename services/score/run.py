@@ -73,7 +73,8 @@ FACTS: Final = pa.schema(
 class _Range:
     """A range to score, what is predicted of it, and the digest of all that its rows follow from.
 
-    poses: the mirror poses that are scored. blame: why what is predicted of them is refused unread.
+    poses: the mirror poses that are scored. keys: of one pose, the predictions that are; empty: the items without any. None: all.
+    blame: why they are refused unread.
     """
 
     place: str
@@ -83,24 +84,34 @@ class _Range:
     predicted: Mapping[Key, tuple[str, ...]]
     asked: Asked
     digest: str
+    keys: tuple[Key, ...] | None = None
     blame: str = ""
 
     @property
     def key(self) -> str:
         """The name of its rows among those that are kept."""
-        return f"{self.digest} {self.poses[0]} {len(self.poses)} {self.blame}"
+        return f"{self.digest} {self.poses[0]} {len(self.poses)} {self.keys} {self.blame}"
 
     def instead(self, end: "Ended") -> "Iterator[_Range]":
-        """What is asked in place of a range that ended its process: its poses one by one, of which one is refused then.
+        """What is asked in place of a range that ended its process: its poses one by one, then what is predicted of one.
 
-        Raises MachineError where one pose alone was killed from outside.
+        A prediction that ends its process alone is refused. Raises MachineError where a pose was killed from outside.
         """
         if len(self.poses) > 1:
             yield from (replace(self, poses=(pose,)) for pose in self.poses)
         elif end.how == "killed":
             raise MachineError(f"scoring pose {self.poses[0]}: {end.detail}: start again, what is scored is kept")
+        elif self.keys is None:
+            each = [(key,) for key in self.predicted if key[1] in self.poses]
+            yield from (replace(self, keys=keys) for keys in [(), *each])
         else:
-            yield replace(self, blame=f"scoring it {end.detail}")
+            remedy = "" if end.how == "crashed" else ": make it smaller"
+            yield replace(self, blame=f"scoring it {end.detail}{remedy}")
+
+    def has(self, row: Row) -> bool:
+        """Whether an item of its poses is to be scored."""
+        key = row["kind"], row["pose_id"], row["region"]
+        return self.keys is None or key in self.keys or not (self.keys or key in self.predicted)
 
 
 def score_dataset(store: Store, predictions: Predictions, asked: Asked, out: Path) -> Path:
@@ -230,11 +241,12 @@ def _files(place: str) -> tuple[StoredFiles, Job]:
 def _rows(item: _Range) -> list[Row]:
     files, job = _files(item.place)
     stored = RangeRows.of(lambda table: range_rows(files.store, item.records, table))
+    predicted = item.predicted if item.keys is None else {key: item.predicted[key] for key in item.keys}
     rows: list[Row] = []
     for pair in pairs_of(stored, RangeFiles(files, item.records)):
         if pair.mirror is None or pair.mirror.pose_id in item.poses:
-            rows += score_pair(pair, item.folder, item.predicted, item.asked, job, item.blame)
-    return rows
+            rows += score_pair(pair, item.folder, predicted, item.asked, job, item.blame)
+    return list(filter(item.has, rows))
 
 
 def _table(rows: Sequence[Row]) -> pa.Table:

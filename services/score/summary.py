@@ -307,20 +307,13 @@ def compare(a: pa.Table, b: pa.Table) -> dict[str, Any]:
     return answer
 
 
-def _numbers(table: pa.Table, name: str) -> Array:
-    """[N] float64, nan for null and for a column that is not there."""
-    if name not in table.column_names:
-        return np.full(table.num_rows, np.nan)
-    return np.array(table[name].cast(pa.float64()).to_numpy(), np.float64)
-
-
 def _equal(table: pa.Table, name: str, word: str) -> NDArray[np.bool_]:
     return np.asarray(pc.equal(table[name], word).to_numpy(), np.bool_)
 
 
 def scenes_of(table: pa.Table) -> NDArray[np.int64]:
     """[N] numbers of scenes from 0 up; items without a scene are one together."""
-    return np.unique(_numbers(table, "scene_id"), return_inverse=True)[1].reshape(-1)
+    return np.unique(table["scene_id"].cast(pa.float64()).to_numpy(), return_inverse=True)[1].reshape(-1)
 
 
 def _groups(table: pa.Table) -> dict[str, dict[str, NDArray[np.bool_]]]:

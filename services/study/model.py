@@ -299,7 +299,7 @@ def _values(key: str, values: Iterable[float | str]) -> dict[str, Changes]:
 
 def resized(job: Job, width: int) -> Changes:
     """The job's camera with another number of pixels and the same field of view."""
-    sensor = job.cameras.sensor
+    sensor = job.cameras.sensor.fixed()
     scaled = {name: value * width / sensor.width for name, value in sensor}
     values = scaled | {"width": width, "height": max(1, round(scaled["height"]))}
     return {f"cameras.sensor.{name}": value for name, value in values.items()}

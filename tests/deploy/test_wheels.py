@@ -18,7 +18,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT
 from services.dataset.dataset import open_dataset
 from tests.datasets import make_dataset
 from tests.docs.test_pages import READERS, blocks
-from tests.services.export.conftest import SHAPED, with_samples
+from tests.services.export.conftest import SHAPED, STUDIO, with_samples
 from workers.store.images import encode_png
 
 ROOT = Path(__file__).parents[2]
@@ -195,6 +195,7 @@ def test_blocks_of_pages_run_as_typed_from_a_wheel_outside_of_any_checkout(page,
         make_dataset(tmp_path / "data/tabletop", scenes=6, categories=["mug", "can"])
     if page == "docs/export.md":
         with_samples(make_dataset(tmp_path / "data/targets", **SHAPED)[0])
+        make_dataset(tmp_path / "data/studio", **STUDIO)
     typed = [(language, text) for language, where, text in blocks(page) if where == installation and language]
     python = "\n".join(text for language, text in typed if language == "python")
     environ = environment_of(installation, built, tmp_path)

@@ -62,7 +62,7 @@ SMALLER = {
     r"tests/hard_cases": "tests/test_layers.py",
     r"--scenes 64 --workers 2": "--scenes 2",
     r"(\./verso tradeoff .*)": r"\1 --budget 60s --knobs step",
-    r"(--out data/targets)": r"\1 --scenes 2",
+    r"(--out data/(targets|studio))": r"\1 --scenes 2",
     r"(run deploy/jobs/captures.yaml)": r"\1 --scenes 1 --set captures.simulate.views=8 " + TINY,
     r"--views 40 --category mug": f"--views 10 --category mug {TINY}",
     r"~/my_meshes": "meshes",
@@ -82,6 +82,7 @@ PAGES = {
     "docs/own_meshes.md": pytest.mark.slow,
     "docs/queue.md": pytest.mark.slow,
     "docs/report.md": pytest.mark.slow,
+    "docs/studio.md": pytest.mark.slow,
     "deploy/README.md": pytest.mark.minute,
     "deploy/examples/README.md": pytest.mark.slow,
 }

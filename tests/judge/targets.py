@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import cast, get_args
 
 import yaml
 
@@ -65,7 +65,9 @@ def pairs_of(job: Job, output: SceneOutput) -> Iterator[StoredPair]:
     kinds = stored_kinds(job)
     for parent in dict.fromkeys(row["parent_id"] for row in output.rows["views"]):
         views = {
-            view_name(row["role"], row["number"]): row for row in output.rows["views"] if row["parent_id"] == parent
+            view_name(str(row["role"]), cast("int | None", row["number"])): row
+            for row in output.rows["views"]
+            if row["parent_id"] == parent
         }
         ids = {row["pose_id"] for row in views.values()}
         objects = [row for row in output.rows["objects"] if row["pose_id"] in ids]

@@ -81,7 +81,7 @@ def _direction(azimuth: float, elevation: float) -> Array:
 
 
 STUDIO_LIGHTS: Mapping[str, Appearance] = {
-    "even": Appearance((0.95,) * 3, (Light(_direction(0.0, 0.5), (0.0,) * 3),), (0.0,) * 3, below=(0.62,) * 3),
+    "even": Appearance((0.95,) * 3, (Light(_direction(0.0, 0.5), (0.0,) * 3),), (0.0,) * 3, (0.45,) * 3, sheen=0.15),
     "three_point": Appearance(
         (0.25,) * 3,
         (
@@ -93,7 +93,7 @@ STUDIO_LIGHTS: Mapping[str, Appearance] = {
         below=(0.2,) * 3,
     ),
     "environment": Appearance(
-        (0.85, 0.88, 0.92), (Light(_direction(0.0, 0.5), (0.0,) * 3),), (0.0,) * 3, below=(0.38, 0.36, 0.33)
+        (0.85, 0.88, 0.92), (Light(_direction(0.0, 0.5), (0.0,) * 3),), (0.0,) * 3, (0.38, 0.36, 0.33), sheen=0.3
     ),
 }
 """The light of studio scenes, fixed in the world. Nothing of it casts a shadow."""

@@ -136,9 +136,13 @@ class Catalogue:
             if library.skipped
         ]
 
+    def describe_plain(self) -> list[str]:
+        """One line for each folder with shapes that no file gives a picture or a colour."""
+        return [f"{library.source}: {message}" for library in self.libraries() for message in library.plain]
+
     def describe_doubts(self) -> list[str]:
-        """One line for each folder with files that stand on another axis than was decided."""
-        lines = []
+        """Lines on each folder with files that stand on another axis than was decided, or that have no colour."""
+        lines = self.describe_plain()
         for library in self.libraries():
             if not library.doubts:
                 continue
@@ -155,7 +159,7 @@ class Catalogue:
         if isinstance(settings, ProceduralSource):
             from workers.assets.builtin.make import make_asset
 
-            return make_asset(ref.category, settings, ref.index, self.assets.density_kg_m3)
+            return make_asset(ref.category, settings, ref.index, self.assets.density_of(ref.category))
         from workers.assets.library.shapes import load_shape
 
         assert library is not None

@@ -90,7 +90,8 @@ def board_asset(board: Board, settings: Assets) -> Asset:
 def _asset(names: tuple[str, str, str, str], shape: Shape, settings: Assets, note: str) -> Asset:
     """`names`: instance id, category, licence, and `source` of the shape."""
     instance_id, category, licence, source = names
-    mass = mass_properties(shape, settings.density_kg_m3, settings.shell_kg_m2)
+    density = settings.density_of(category)
+    mass = mass_properties(shape, density, settings.shell_kg_m2)
     return Asset(
         instance_id=instance_id,
         category=category,
@@ -103,7 +104,7 @@ def _asset(names: tuple[str, str, str, str], shape: Shape, settings: Assets, not
         T_source_to_object=frozen_array(np.eye(4)),
         scale=1.0,
         watertight=mass.solid,
-        volume_m3=mass.mass_kg / settings.density_kg_m3 if mass.solid else None,
+        volume_m3=mass.mass_kg / density if mass.solid else None,
         shareable=True,
         notes=(note,),
     )

@@ -95,6 +95,7 @@ def as_refusal(name: str | Path, refuse: Refuse = refuse_input, remedy: str = CO
         raise
     except Exception as error:
         shown = plain_line(str(name), LONGEST_NAME)
+        remedy = "make it smaller" if isinstance(error, MemoryError) else remedy
         raise refuse("unreadable", f"{shown} cannot be read: {describe_error(error)}: {remedy}") from error
 
 

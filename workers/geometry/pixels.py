@@ -355,20 +355,6 @@ def distort(u: Array, v: Array, lens: Distortion, k: Intrinsics) -> tuple[Array,
     return x.reshape(u.shape), y.reshape(v.shape)
 
 
-def spread_colours(rgb: NDArray[np.uint8], region: NDArray[np.uint8]) -> None:
-    """Give each pixel of rgb [H, W, 3] that shows nothing (region [H, W] is 0) the colour of the nearest that does, in place."""
-    if not region.any() or region.all():
-        return
-    _, nearest = cv2.distanceTransformWithLabels(
-        (region == 0).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    shown = np.flatnonzero(region)
-    at = np.zeros(int(nearest.max()) + 1, np.int64)
-    at[nearest.reshape(-1)[shown]] = shown
-    beside = region == 0
-    rgb[beside] = rgb.reshape(-1, 3)[at[nearest[beside]]]
-
-
 def undistort(u: Array, v: Array, lens: Distortion, k: Intrinsics) -> tuple[Array, Array]:
     """The inverse of `distort`: pinhole coordinates of (u, v) through the lens; nan where the lens maps nothing to."""
     x, y = rays_of_pixels(np.stack([u.ravel(), v.ravel()], axis=1), k, opencv_lens(lens)).T
@@ -393,3 +379,10 @@ def _draw(points: Array, focal: tuple[float, float, float, float], lens: Array, 
             pixels[n, 0] = fx * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) + cx
             pixels[n, 1] = fy * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + cy
     return pixels
+
+
+def is_inner(region: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """[H, W]: the pixels that, with all eight beside them, show something; region [H, W]. None at the image's edge does."""
+    shown = (region > 0).astype(np.uint8)
+    inner: NDArray = cv2.erode(shown, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return inner > 0

@@ -186,6 +186,11 @@ class World:
         asleep = pybullet.ACTIVATION_STATE_SLEEP
         pybullet.changeDynamics(self.bodies[body], -1, activationState=asleep, physicsClientId=self.client)
 
+    def keep_apart(self, body: int, other: int) -> None:
+        """Look for no contacts of these two bodies."""
+        pair = self.bodies[body], self.bodies[other], -1, -1
+        pybullet.setCollisionFilterPair(*pair, enableCollision=0, physicsClientId=self.client)
+
     def put_away(self, body: int) -> None:
         """Hold a body for ever where nothing meets it, at the height that it has."""
         (_, _, z), _ = self.pose(body)

@@ -215,8 +215,9 @@ ASLANT_RAD = 0.3
 MOST_NUDGES = 3
 """What stands still again so often after a nudge stands; a nudge moves by a tenth of a millimetre, and friction keeps some."""
 
-MOST_STEPS = 160
-"""Of piles of eight most need 3 to 60 steps; what falls from a part that fills a hollow does so by half a millimetre a step."""
+MOST_STEPS, STEPS_EACH = 160, 40
+"""Steps of few bodies, and for each of more. Of piles of eight most need 3 to 60; what falls from a part that fills a hollow does
+so by half a millimetre a step, and of cups in one another each waits for the one below: six need 190."""
 
 SLIDING_FALL_M = 6e-3
 """Free fall in the steps of what slides or tumbles freely; what creeps gets longer ones."""
@@ -261,22 +262,23 @@ def rest(
     poses: Sequence[Pose],
     ground: Surface,
     friction: float,
-    most_sliding: int = MOST_STEPS,
+    most_sliding: float = math.inf,
     spinning_m: float = 0.0,
 ) -> Rested:
     """Bodies let go at rest from `poses` (`T_world_obj`), followed without speed until nothing moves any more.
 
     What overlaps is moved apart, what hovers falls, what is out of balance tips, also from an edge or a corner that it was
-    balanced on. friction: the coefficient of a contact. Not `still` after `MOST_STEPS` or so many in which something slides, or
-    where overlapping bodies are jammed.
+    balanced on. friction: the coefficient of a contact. Not `still` after `MOST_STEPS` and more or so many in which something
+    slides, or where overlapping bodies are jammed.
     """
+    most = max(MOST_STEPS, STEPS_EACH * len(things))
     surfaces, at, near = [*(thing.surface for thing in things), ground], tuple(poses), None
     reaches = np.array([np.linalg.norm(one.surface.vertices - one.mass.com, axis=1).max() for one in things])
     fall_m, longest_m, known_m, nudges, sliding = FALL_M, LONGEST_FALL_M, 0.0, 0, 0
     pushed, motion = np.zeros(0), None
-    for number in range(MOST_STEPS + (MOST_SPUN if spinning_m else 0)):
+    for number in range(most + (MOST_SPUN if spinning_m else 0)):
         sliding += fall_m < SLIDING_FALL_M
-        if sliding > most_sliding and number < MOST_STEPS:
+        if sliding > most_sliding and number < most:
             return Rested(at, False, number)
         points = [transform(T, thing.surface.vertices) for T, thing in zip(at, things, strict=True)] + [ground.vertices]
         if near is None or known_m <= 0.0:
@@ -285,7 +287,7 @@ def rest(
         inertias = [thing.inertia(T) for T, thing in zip(at, things, strict=True)]
         given = inertias, contacts, friction
         try:
-            spun_m = spinning_m if number >= MOST_STEPS else 0.0
+            spun_m = spinning_m if number >= most else 0.0
             motion, jammed = _step_past_seams(*given, fall_m, spun_m, motion)
             if _farthest(motion, reaches) <= STILL * fall_m and nudges < MOST_NUDGES and not jammed:
                 nudge, nudges = _nudge(*given, reaches, spun_m, motion), nudges + 1
@@ -303,7 +305,7 @@ def rest(
             longest_m = fall_m = max(FALL_M, fall_m / 4)
         else:
             fall_m = _next_fall_m(fall_m, longest_m, moved_m)
-    return Rested(at, False, MOST_STEPS)
+    return Rested(at, False, most)
 
 
 def _step_past_seams(

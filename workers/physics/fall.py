@@ -160,12 +160,14 @@ class Watch:
 
     stops: conditions by name, of which one ends it. leaves: what holds of an object that is put away, while the others go on.
     standing: ends the fall of a single object sooner. sleeping: what rests costs no time until something that moves touches it.
+    apart: pairs of bodies that cannot meet before it ends, which cost no time.
     """
 
     stops: Mapping[str, StopCondition] = field(default_factory=dict)
     leaves: StopCondition | None = None
     standing: StandingCondition | None = None
     sleeping: bool = False
+    apart: Sequence[tuple[int, int]] = ()
 
 
 def fall(
@@ -192,6 +194,8 @@ def fall(
     with open_world(placed, ground, physics, steps.looked, reach_m, steps.kept) as world:
         for number in range(len(bodies)):
             world.set_velocity((0.0, 0.0, -speed_m_s), body=number)
+        for pair in watch.apart:
+            world.keep_apart(*pair)
         outcome = _Simulation(world, bodies, physics, steps, watch).run(physics.max_settle_s - fallen_s)
     ended = tuple(T @ invert(body.T_obj_body) for T, body in zip(outcome.poses, bodies, strict=True))
     return dataclasses.replace(outcome, poses=ended, seconds=outcome.seconds + fallen_s)

@@ -21,7 +21,7 @@ from workers.physics.bullet import GRAVITY_M_S2, SLOP_M, SLOP_SHARE, GroundShape
 from workers.physics.contact_surface import faces_within, skin_of
 from workers.physics.contacts import contacts_within
 from workers.physics.effects import is_convex
-from workers.physics.exact_rest import LEVEL, MOST_STEPS, Rested, rest
+from workers.physics.exact_rest import LEVEL, Rested, rest
 from workers.physics.fall import FINEST, Outcome, StepSizes, Watch, fall, strays
 from workers.physics.placement import TOUCHING_M, Form, Placement, farthest_m, forms_of, place, placed_mesh
 from workers.physics.pour import points_of
@@ -84,7 +84,7 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
     changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
     held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
     for far_m in (2.0**number * FAR_M for number in range(MOST_HOLDS)):
-        most = POURED_STEPS if drop.in_waves else MOST_STEPS
+        most = POURED_STEPS if drop.in_waves else math.inf
         rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction, most, spinning_m)
         if not rested.still or len(poses) >= CROWD:
             return rested
@@ -144,18 +144,19 @@ def _let_go(drop: Drop, placement: Placement, poses: Sequence[Pose], far_m: floa
     margins_m = [THIN * make_body(start).margin_m for start in drop.starts]
     slop_m = min(SLOP_M, SLOP_SHARE * min(margins_m))
     insets_m = [0.0 if drop.single else margin_m - slop_m / 2.0 for margin_m in margins_m]
-    skins = _skins(placement, poses, near_m, top.height_m if level else -math.inf, insets_m)
+    skins, apart = _skins(placement, poses, near_m, top.height_m if level else -math.inf, insets_m)
     whole = [make_body(start, parts) for start, parts in zip(drop.starts, skins, strict=True)]
     bodies = [dataclasses.replace(body, margin_m=margin_m) for body, margin_m in zip(whole, margins_m, strict=True)]
     ground: GroundShape = split_by_side(drop.table.mesh)
     if level:
         ground = top.height_m - (margins_m[0] - insets_m[0] - slop_m)
     begun = np.stack([(T @ body.T_obj_body)[:3, 3] for T, body in zip(poses, bodies, strict=True)])
-    watch, pieces = Watch({"far": strays(begun, far_m)}), sum(map(len, skins))
+    watch, counts = Watch({"far": strays(begun, far_m)}, apart=apart), [len(skin) for skin in skins]
     if drop.budget.left <= 0.0:
-        raise SettleError("unsupported", _too_much(drop, pieces))
+        raise SettleError("unsupported", _too_much(drop, sum(counts)))
     outcome = fall(bodies, poses, ground, physics, StepSizes(physics.step_hz, math.inf), 0.0, watch, reach_m=SKIN_M)
-    drop.budget.left -= outcome.seconds * physics.step_hz * pieces**2
+    meeting = set(itertools.combinations(range(len(skins)), 2)).difference(apart)
+    drop.budget.left -= outcome.seconds * physics.step_hz * sum(counts[i] * counts[j] for i, j in meeting)
     return outcome
 
 
@@ -169,8 +170,8 @@ def _too_much(drop: Drop, pieces: int) -> str:
 
 def _skins(
     placement: Placement, poses: Sequence[Pose], near_m: float, level_m: float, insets_m: Sequence[float]
-) -> list[tuple[Array, ...]]:
-    """The pieces [N, 3] of each object, in its own frame, that are within this of others or of the table.
+) -> tuple[list[tuple[Array, ...]], list[tuple[int, int]]]:
+    """(the pieces [N, 3] of each object, in its own frame, that are within this of others or of the table; pairs that are not).
 
     insets_m: how far each one's are inside of its mesh, as margins and overlap stand out: a cup in a tapered cup would rise by
     eight times as much. level_m: height of the half-space that the table is here, -inf if it is none. Only corners of an object's
@@ -178,17 +179,19 @@ def _skins(
     """
     surfaces, level = placement.surfaces, [math.isfinite(level_m) and not is_convex(one) for one in placement.starts]
     points = [transform(T, one.vertices) for T, one in zip((*poses, np.eye(4)), surfaces, strict=True)]
-    near = [np.zeros(len(one.faces), dtype=np.bool_) for one in surfaces]
+    near, apart = [np.zeros(len(one.faces), dtype=np.bool_) for one in surfaces], list[tuple[int, int]]()
     for i, j in itertools.combinations(range(len(surfaces)), 2):
         if j < len(poses) or not level[i]:
             here, there = faces_within((points[i], surfaces[i].faces), (points[j], surfaces[j].faces), near_m)
             near[i][here] = near[j][there] = True
+            if j < len(poses) and not len(here):
+                apart.append((i, j))
     skins = []
     for number, (start, T) in enumerate(zip(placement.starts, poses, strict=True)):
         low = start.hull.vertices[level[number] & (transform(T, start.hull.vertices)[:, 2] <= level_m + near_m)]
         skin = skin_of(surfaces[number], np.flatnonzero(near[number]), SKIN_M, insets_m[number])
         skins.append((*skin, *(corner + np.add(SPIKE, [0.0, 0.0, insets_m[number]]) @ T[:3, :3] for corner in low)))
-    return skins
+    return skins, apart
 
 
 def release_again(

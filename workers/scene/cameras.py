@@ -15,7 +15,7 @@ import numpy as np
 from schemas.base import Array, Pose, Range, frozen_array
 from schemas.dataset.layout import is_stored
 from schemas.errors import ViewError
-from schemas.job.cameras import SPHERE_SHARE, VIEW_PRESETS, Cameras, Mirror, More, Ring, Sensor, Sphere, share_of
+from schemas.job.cameras import SPHERE_SHARE, VIEW_PRESETS, Cameras, Mirror, More, Ring, Sphere, share_of
 from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, ScenePlan
 from schemas.scene.shape import Mesh
@@ -31,8 +31,15 @@ def draw_camera(rng: np.random.Generator, further: np.random.Generator, cameras:
     """An input camera on the job's orbit about the centre of the table top; `further` draws what has a range by choice."""
     inclination = rng.uniform(cameras.orbit.inclination_rad.low, cameras.orbit.inclination_rad.high)
     yaw = rng.uniform(cameras.orbit.yaw_rad.low, cameras.orbit.yaw_rad.high)
-    T = orbit_pose(centre, inclination, yaw, _draw_distance(further, cameras.orbit.radius_m, 1.0))
-    return Camera(Intrinsics.of(cameras.sensor), frozen_array(T))
+    orbit, sensor = cameras.orbit, cameras.sensor
+    radius_m = _draw_distance(further, orbit.radius_m, 1.0)
+    aim = np.array([_draw(further, orbit.aim_m) for _ in range(3)])
+    T = orbit_pose(centre + aim, inclination, yaw, radius_m)
+    if roll := _draw(further, orbit.roll_deg):
+        T = T @ pose(rotation_about(UP, math.radians(roll)), np.zeros(3))
+    if sensor.has_ranges:
+        sensor = sensor.fixed(tuple(further.random(3).tolist()))
+    return Camera(Intrinsics.of(sensor), frozen_array(T))
 
 
 def place_beside(camera: Camera, job: Job) -> dict[Role, Camera]:
@@ -51,9 +58,15 @@ def place_beside(camera: Camera, job: Job) -> dict[Role, Camera]:
     }
 
 
-def place_mirror_camera(camera: Camera, d_z_m: float, mirror: Mirror) -> Camera:
-    """The camera on the other side of the object."""
-    return Camera(camera.intrinsics, frozen_array(mirror_pose(camera.T_world_cam, d_z_m, mirror.distance_m(d_z_m))))
+def place_mirror_camera(camera: Camera, d_z_m: float, mirror: Mirror, share: float = 0.5) -> Camera:
+    """The camera on the other side of the object; of a range of T_z this share of the way."""
+    T = mirror_pose(camera.T_world_cam, d_z_m, mirror.distance_m(d_z_m, share))
+    return Camera(camera.intrinsics, frozen_array(T))
+
+
+def draw_mirror_share(chance: SceneChance, mirror: Mirror, pair: int) -> float:
+    """Where in its range of T_z the mirror camera of a pair stands."""
+    return float(chance.stream(Stream.MIRROR, pair).random()) if isinstance(mirror.T_z_m, tuple) else 0.5
 
 
 def mirror_pose(T_world_cam: Pose, d_z_m: float, T_z_m: float = 1.3, up: Array = UP) -> Pose:
@@ -84,7 +97,7 @@ def frame_cameras(job: Job, plan: ScenePlan, poses: Sequence[Pose]) -> ScenePlan
     """
     placed, cameras = list(zip(plan.objects, poses, strict=True)), plan.input_cameras
     if (share := job.cameras.orbit.share) is not None:
-        return replace(plan, input_cameras=tuple(_frame(job, camera, placed, share) for camera in cameras))
+        return replace(plan, input_cameras=tuple(_frame(job, plan, camera, placed, share) for camera in cameras))
     for start, T in placed:
         box = start.asset.shape.bounds
         size, middle = float(np.linalg.norm(box[1] - box[0])), transform(T, box.mean(axis=0)[None, :])[0]
@@ -97,11 +110,20 @@ def frame_cameras(job: Job, plan: ScenePlan, poses: Sequence[Pose]) -> ScenePlan
     return plan
 
 
-def _frame(job: Job, camera: Camera, placed: Sequence[tuple[ObjectStart, Pose]], share: float) -> Camera:
+def _centre_of(plan: ScenePlan) -> Array:
+    """The point [3] that orbits are about: the middle of the table's top, or of a studio scene."""
+    return np.array([0.0, 0.0, 0.0 if plan.ground is None else plan.table.top.height_m])
+
+
+def _frame(
+    job: Job, plan: ScenePlan, camera: Camera, placed: Sequence[tuple[ObjectStart, Pose]], share: float
+) -> Camera:
     """The camera as near to the middle of the objects as `share`, the picture's edges and the range of depth allow."""
     points = np.concatenate([transform(T, start.hull.vertices) for start, T in placed])
     lower, upper = points.min(axis=0), points.max(axis=0)
     middle, size, k = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower)), camera.intrinsics
+    if any(job.cameras.orbit.aim_m):  # what was drawn stands one metre from the point that it looks at
+        middle = middle + camera.position + camera.T_world_cam[:3, 2] - _centre_of(plan)
     nearest_m, farthest_m = max(NEAR_M, job.images.depth_range_m.low) / INSIDE, job.images.depth_range_m.high
     edges = 0.5 * np.array([k.width, k.height])
 
@@ -158,7 +180,10 @@ def place_more(
     """
     for entry in job.cameras.more:
         if entry.beside is None:
-            rng, k = chance.stream(Stream.MORE, crc32(entry.name.encode())), intrinsics_of(entry, job.cameras.sensor)
+            rng, k = (
+                chance.stream(Stream.MORE, crc32(entry.name.encode())),
+                intrinsics_of(entry, Intrinsics.of(job.cameras.sensor)),
+            )
             if entry.poses is None:
                 placed, first = _Placed.of(plan, poses), plan.input_cameras[0]
                 stands = ((T, k) for T in _stands(entry, rng, placed, k, first, job.images.depth_range_m))
@@ -178,13 +203,14 @@ def place_fixed(job: Job, seen_from: Mapping[Role, Camera]) -> Iterator[NamedCam
             turn = np.eye(3)
             for axis, angle_deg in zip(np.eye(3), entry.rotation_deg, strict=True):
                 turn = rotation_about(axis, math.radians(angle_deg)) @ turn
-            T = seen_from[entry.beside].T_world_cam @ pose(turn, np.array(entry.offset_m))
-            yield NamedCamera(entry.name, 0, Camera(intrinsics_of(entry, job.cameras.sensor), frozen_array(T)))
+            first = seen_from[entry.beside]
+            T = first.T_world_cam @ pose(turn, np.array(entry.offset_m))
+            yield NamedCamera(entry.name, 0, Camera(intrinsics_of(entry, first.intrinsics), frozen_array(T)))
 
 
-def intrinsics_of(entry: More, sensor: Sensor) -> Intrinsics:
-    """The pinhole camera of an entry, which has the job's sensor unless it says otherwise."""
-    k = Intrinsics.of(entry.sensor or sensor)
+def intrinsics_of(entry: More, others: Intrinsics) -> Intrinsics:
+    """The pinhole camera of an entry, which has that of others unless it says otherwise."""
+    k = others if entry.sensor is None else Intrinsics.of(entry.sensor)
     if (fov_deg := entry.pinhole_fov_deg) is None:
         return k
     focal = 0.5 * k.width / math.tan(math.radians(0.5 * fov_deg))
@@ -205,9 +231,8 @@ class _Placed:
         points = np.concatenate([transform(T, each.hull.vertices) for each, T in zip(plan.objects, poses, strict=True)])
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
         radius_m = float(np.linalg.norm(points - middle, axis=1).max())
-        side_m = max(float(start.asset.extents_m.max()) for start in plan.objects)
-        top_m = 0.0 if plan.ground is None else plan.table.top.height_m
-        return cls(middle, radius_m, side_m, np.array([0.0, 0.0, top_m]))
+        side_m = float(np.ptp(points, axis=0).max())  # as it lies: published methods measure it after they placed it
+        return cls(middle, radius_m, side_m, _centre_of(plan))
 
     def point(self, about: str | tuple[float, float, float]) -> Array:
         """The point that cameras look at, world."""

@@ -30,6 +30,7 @@ class Stream(IntEnum):
     SENSOR = 17
     ORBIT = 18
     MORE = 19
+    MIRROR = 20
 
 
 _SENSORS = {"depth_noise": Stream.SENSOR_DEPTH, "rgb_noise": Stream.SENSOR_RGB, "exposure": Stream.SENSOR_EXPOSURE}

@@ -15,7 +15,8 @@ from schemas.scene.view import MODALITIES, Role, View
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
 from workers.geometry.pixels import measure_regions
-from workers.scene.cameras import place_beside, place_fixed, place_mirror_camera
+from workers.scene.cameras import draw_mirror_share, place_beside, place_fixed, place_mirror_camera
+from workers.scene.chance import SceneChance
 from workers.scene.labels import compare_views, derive_projected, patch_object_fraction, projection_shares
 from workers.scene.pairs import object_distance
 from workers.scene.rows import amodal_columns, image_boxes
@@ -190,7 +191,9 @@ def _check_cameras(job: Job, stored: Mapping[str, View], views: Mapping[str, Row
     first = stored["input"]
     assert first.region is not None
     d_z = object_distance(first.depth, first.region, job.images, job.cameras.mirror)
-    mirror = place_mirror_camera(first.camera, d_z, job.cameras.mirror)
+    pair = first.parent_id // 2 % job.pairs_per_scene
+    share = draw_mirror_share(SceneChance(job.seed, views["input"]["scene_id"]), job.cameras.mirror, pair)
+    mirror = place_mirror_camera(first.camera, d_z, job.cameras.mirror, share)
     poses = {**place_beside(first.camera, job), "mirror": mirror, "projected": mirror}
     fixed = place_fixed(job, {"input": first.camera, "mirror": mirror})
     poses |= {view_name(named.name, named.number): named.camera for named in fixed}

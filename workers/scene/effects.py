@@ -218,12 +218,13 @@ def _outside(facts: Facts, points: Array) -> str | None:
 
 
 def _views(facts: Facts) -> Iterator[tuple[Camera, ...]]:
-    """Every camera of the scene; of the mirror camera, whose d_z is not known yet, the two ends of where it may be."""
+    """Every camera of the scene; of the mirror camera, whose d_z is not known yet, the ends of where it may be."""
     job = facts.job
     for camera in facts.plan.input_cameras:
         yield (camera,)
         yield from ((near,) for near in place_beside(camera, job).values())
-        yield tuple(place_mirror_camera(camera, d_z, job.cameras.mirror) for d_z in job.images.depth_range_m)
+        ends = itertools.product(job.images.depth_range_m, (0.0, 1.0))
+        yield tuple(place_mirror_camera(camera, d_z, job.cameras.mirror, share) for d_z, share in ends)
 
 
 _NOISY_DEPTH = _where(

@@ -18,7 +18,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT
 from schemas.scene.view import ROLES, VIEW_ROLES, Camera, Pair, Role, View
 from workers.geometry.pixels import dequantise_depth, quantise_depth
 from workers.render.pathtraced import draw_view
-from workers.scene.cameras import place_beside, place_fixed, place_mirror_camera
+from workers.scene.cameras import draw_mirror_share, place_beside, place_fixed, place_mirror_camera
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.context import WorkerContext
 from workers.scene.labels import compare_views, count_unoccluded, derive_projected, label_regions, projection_shares
@@ -75,7 +75,8 @@ def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
     if not effects.runs("mirror"):
         return pair
     with stopwatch.effect("mirror"):
-        mirror_camera = place_mirror_camera(camera, pair.d_z_m, job.cameras.mirror)
+        share = draw_mirror_share(scene.chance, job.cameras.mirror, number)
+        mirror_camera = place_mirror_camera(camera, pair.d_z_m, job.cameras.mirror, share)
         exact_mirror = render_view(scene, "mirror", number, mirror_camera, sight)
         mirror = sense(scene, exact_mirror, number)
     with stopwatch.stage("check"):
@@ -103,7 +104,8 @@ def make_further(scene: SettledScene, pair: Pair, number: int) -> Iterator[View]
     for named in (*standing, *place_fixed(job, cameras)):
         with scene.stopwatch.effect("further_views"):
             exact = render_view(scene, named.name, number, named.camera, sight, named.number)
-            yield sense(scene, exact, number)
+            view = sense(scene, exact, number)
+        yield view
 
 
 def render_view(
@@ -128,7 +130,7 @@ def render_view(
         depth = quantise_depth(buffer.depth_m, job.images)
     further = draw_targets(scene.posed.things, camera, buffer.region, job, scene.effects, stopwatch, sight)
     alpha = further.pop("alpha", None)
-    rgb = buffer.rgb if alpha is None or buffer.rgb is None else with_alpha(buffer.rgb, alpha)
+    rgb = buffer.rgb if alpha is None or buffer.rgb is None else with_alpha(buffer.rgb, buffer.region, alpha)
     return View(role, pose_id, parent_id, camera, rgb, depth, buffer.region, labels, further, number)
 
 

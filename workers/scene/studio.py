@@ -72,10 +72,11 @@ def _scale(asset: Asset, factor: float) -> Asset:
     parts = [replace(part, vertices=frozen_array(factor * part.vertices)) for part in asset.shape.parts]
     mass, T = asset.mass, asset.T_source_to_object.copy()
     T[:3, 3] *= factor
+    heavier = factor**3 if mass.solid else factor**2  # a shell's mass goes with its surface
     return replace(
         asset,
         shape=Shape(tuple(parts), asset.shape.closed),
-        mass=MassProperties(mass.mass_kg * factor**3, factor * mass.com, factor**5 * mass.inertia, mass.solid),
+        mass=MassProperties(heavier * mass.mass_kg, factor * mass.com, heavier * factor**2 * mass.inertia, mass.solid),
         T_source_to_object=frozen_array(T),
         scale=factor * asset.scale,
         volume_m3=None if asset.volume_m3 is None else asset.volume_m3 * factor**3,

@@ -60,7 +60,7 @@ def _unseen(job: Job, start: ObjectStart, T_world_obj: Pose, camera: Camera) -> 
         opposite = place_mirror_camera(camera, front_m, job.cameras.mirror)
         sides["cameras.mirror.T_z_m"] = ("mirror", opposite, job.cameras.mirror.T_z_m)
     for key, (role, seen_by, given) in sides.items():
-        value = given if isinstance(given, str) else f"{given:g}"
+        value = f"{given:g}" if isinstance(given, float) else given
         local, (near, far), k = (
             transform(invert(seen_by.T_world_cam), points),
             job.images.depth_range_m,

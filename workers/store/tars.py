@@ -128,8 +128,8 @@ _MEMBER = re.compile(
     rf"(?P<pose>\d{{5}}|[1-9]\d{{5,}})\.{_CONTENT}(?P<number>\d{{3}})?(?P<patch>\.patch)?(?:\.obj(?P<object>0|[1-9]\d*))?\.png"
 )
 _LABEL = re.compile(r"(?P<pose>\d{5}|[1-9]\d{5,})\.json", re.ASCII)
+_WORDS = frozenset(modality.word.rstrip("_") for modality in MODALITIES.values())
 _CONTENTS: list[str] = list(dict.fromkeys(image.content for image in IMAGES))
-_WORDS = {modality.word.rstrip("_") for modality in MODALITIES.values()}
 
 
 def member_of(path: str) -> tuple[str, str]:
@@ -295,8 +295,9 @@ class _Archive:
 
 def _match(pattern: re.Pattern[str], name: str) -> re.Match[str]:
     match = pattern.fullmatch(name)
-    if match is None or match["content"].removesuffix(f"_{match['name']}_") not in (
-        _WORDS if match["name"] else _CONTENTS
+    named = match is not None and match["name"] is not None
+    if match is None or (
+        match["content"].partition("_")[0] not in _WORDS if named else match["content"] not in _CONTENTS
     ):
         raise ValueError(f"{name!r} is not the name of an image")
     return match

@@ -26,14 +26,14 @@ function bodyOf(body) {
   const look = { color: body.kind === "object" ? "#878f99" : "#4f555e", roughness: 0.9, side: THREE.DoubleSide, flatShading: true };
   return new THREE.Mesh(shape, new THREE.MeshStandardMaterial({ ...look, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 4000 }));
 }
-function cameraOf(cloud, target) { // a pyramid at the camera's place, and the line along which it looks
-  const T = new THREE.Matrix4().set(...cloud.camera), at = (x, y, z) => new THREE.Vector3(x, y, z).applyMatrix4(T).sub(target);
-  const w = 0.1, h = 0.075, d = 0.16, tip = at(0, 0, 0);
+function cameraOf(pose, target, tint, size) { // a pyramid at the camera's place, and the line along which it looks
+  const T = new THREE.Matrix4().set(...pose), at = (x, y, z) => new THREE.Vector3(x, y, z).applyMatrix4(T).sub(target);
+  const [w, h, d, line] = [0.1, 0.075, 0.16, 0.5].map((one) => one * size), tip = at(0, 0, 0);
   const corners = [[-w, -h], [w, -h], [w, h], [-w, h]].map(([x, y]) => at(x, y, d)), ends = [];
   corners.forEach((corner, i) => ends.push(tip, corner, corner, corners[(i + 1) % 4]));
-  ends.push(tip, at(0, 0, 0.5));
+  ends.push(tip, at(0, 0, line));
   const shape = new THREE.BufferGeometry().setFromPoints(ends);
-  return new THREE.LineSegments(shape, new THREE.LineBasicMaterial({ color: TINTS[cloud.role] }));
+  return new THREE.LineSegments(shape, new THREE.LineBasicMaterial({ color: tint }));
 }
 
 function fill(data) {
@@ -43,8 +43,10 @@ function fill(data) {
     points.userData.tint = TINTS[cloud.role];
     space.parts[cloud.role] = points;
     space.clouds.push(points);
-    cameras.add(cameraOf(cloud, target));
+    cameras.add(cameraOf(cloud.camera, target, TINTS[cloud.role], 1));
   }
+  space.far = data.far;
+  data.cameras.forEach((pose) => cameras.add(cameraOf(pose, target, "#8a8f98", 0.5)));
   data.bodies.forEach((body) => mesh.add(bodyOf(body)));
   Object.assign(space.parts, { mesh, cameras });
   const light = new THREE.DirectionalLight("#ffffff", 0.5);
@@ -61,7 +63,7 @@ function choose(number) { // shows another scene, with the same parts of it
   reset();
 }
 function reset() {
-  Object.assign(space.eye, { yaw: space.yaw, low: 0.55, far: 0.95 });
+  Object.assign(space.eye, { yaw: space.yaw, low: 0.55, far: space.far });
   space.eye.target.set(0, 0, 0);
   look();
 }

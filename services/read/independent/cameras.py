@@ -84,15 +84,19 @@ def beside_transform(entry: Entry) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What cameras are placed about: points [N, 3] of the objects at rest, world; their longest side; the table's height.
+    """What cameras are placed about: points [N, 3] of the objects at rest, world; the table's height.
 
     nearest_m: the least depth that is stored.
     """
 
     points: Array
-    side_m: float
     top_m: float
     nearest_m: float
+
+    @property
+    def side_m(self) -> float:
+        """Of the box of the objects as they lie, the longest."""
+        return float(np.ptp(self.points, axis=0).max())
 
     @property
     def middle(self) -> Array:
@@ -150,8 +154,8 @@ def _distances(radius_m: object, subject: Subject, unit_m: float, sensor: Entry)
         edges = min(min(cx, width - cx) / fx, min(cy, height - cy) / fy)
         half = math.atan(min(math.sqrt(share * width * height / (math.pi * fx * fy)), INSIDE * edges))
         return (max(subject.radius_m / math.sin(half), subject.radius_m + max(NEAR_M, subject.nearest_m) / INSIDE),) * 2
-    low, high = radius_m if isinstance(radius_m, list) else [radius_m] * 2  # type: ignore[list-item]
-    return float(low) * unit_m, float(high) * unit_m
+    low, high = (float(end) * unit_m for end in np.broadcast_to(np.array(radius_m), 2))
+    return low, high
 
 
 def _rolls_deg(T: Array, least: float) -> Array:

@@ -45,13 +45,14 @@ def check_orbit(pair: StoredPair) -> Iterator[str]:
         seen = np.count_nonzero(pair.images["input", "region"] >= FIRST_OBJECT) / pair.images["input", "region"].size
         off = 0.0 if seen <= FIT_SLACK * share else math.inf
     else:
-        least_m, most_m = radius if isinstance(radius, list) else [radius] * 2
-        level = float(axis[:2] @ axis[:2])
-        along_m = float(np.clip(-T_in[:2, 3] @ axis[:2] / level, least_m, most_m)) if level > ROUNDING else least_m
+        # The point looked at, where it is nearest to the vertical line through the centre, or as near as the radius allows.
+        nearest = -(T_in[:2, 3] @ axis[:2]) / max(float(axis[:2] @ axis[:2]), 1e-300)
         # The table's top has some height above the world's origin, a studio's object has its middle there.
-        off = float(np.abs((T_in[:3, 3] + along_m * axis)[: 3 if pair.is_studio else 2]).max())
-    if off > ROUNDING or abs(T_in[2, 0]) > ROUNDING:
-        yield "the input camera does not look at the table's centre from cameras.orbit.radius_m without roll"
+        target = (T_in[:3, 3] + np.clip(nearest, *np.broadcast_to(radius, 2)) * axis)[: 3 if pair.is_studio else 2]
+        off = distance(target, np.clip(target, *orbit["aim_m"]))
+    rolled = abs(math.degrees(math.atan2(-T_in[2, 0], -T_in[2, 1])))
+    if off > ROUNDING or rolled > max(map(abs, orbit["roll_deg"])) + 1e-9:
+        yield "the input camera does not look at the table's centre, or beside it, from cameras.orbit.radius_m, with its roll"
     if not low - ROUNDING <= -axis[2] <= high + ROUNDING:
         yield "the input camera's inclination is outside cameras.orbit.inclination_rad"
 
@@ -79,7 +80,11 @@ def check_poses(pair: StoredPair) -> Iterator[str]:
         role: T_in @ _transform(np.eye(3), beside["offset_m"]) for role, beside in derive.beside(pair.job).items()
     }
     T_z = cameras["mirror"]["T_z_m"]
-    other_side = _derive_rolled_mirror if pair.is_captured else _derive_mirror
+    if isinstance(T_z, list) and "mirror" in pair.views:  # drawn: what there is, as far as it is in the range
+        there = matrix(pair.views["mirror"], "T_world_cam")
+        T_z = float(np.clip((T_in[:3, 3] + d_z * T_in[:3, 2] - there[:3, 3]) @ there[:3, 2], *T_z))
+    rolls = pair.is_captured or any(cameras["orbit"]["roll_deg"])
+    other_side = _derive_rolled_mirror if rolls else _derive_mirror
     expected["mirror"] = expected["projected"] = other_side(T_in, d_z, MIRROR_FIT * d_z if T_z == "fit" else T_z)
     fixed = {f"{name}_000": entry for name, entry in pair.named.items() if entry["beside"]}
     expected |= {key: expected.get(entry["beside"], T_in) @ beside_transform(entry) for key, entry in fixed.items()}
@@ -115,10 +120,9 @@ def _subject(pair: StoredPair) -> Subject:
     world = {region: (shape.points.reshape(-1, 3), T) for region, shape, T in things_of(pair)}
     at = {region: points @ T[:3, :3].T + T[:3, 3] for region, (points, T) in world.items()}
     objects = [region for region in world if region >= FIRST_OBJECT]
-    side_m = max(float(np.ptp(world[region][0], axis=0).max()) for region in objects)
     top_m = float(at[TABLE][:, 2].max()) if TABLE in at else 0.0
     nearest_m = pair.job["images"]["depth_range_m"][0]
-    return Subject(np.concatenate([at[region] for region in objects]), side_m, top_m, nearest_m)
+    return Subject(np.concatenate([at[region] for region in objects]), top_m, nearest_m)
 
 
 def _derive_d_z(pair: StoredPair) -> float:

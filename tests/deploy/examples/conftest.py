@@ -37,12 +37,12 @@ def pairs(few) -> list[Pair]:
     return list(open_dataset(few.root).pairs())
 
 
-def is_behind(pair: Pair, points: NDArray[np.float64], margin_m: float = 0.0) -> NDArray[np.bool_]:
-    """[N] whether the object is before points [N, 3] of the world, by more than the margin, as the input camera sees them."""
+def is_behind(pair: Pair, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """[N] whether the object is before points [N, 3] of the world, as the input camera sees them."""
     eye = pair.input.T_world_cam[:3, 3]
     first = np.full(len(points), np.inf)
     places, at, _ = pair.mesh().ray.intersects_location(
         np.tile(eye, (len(points), 1)), points - eye, multiple_hits=False
     )
     first[at] = np.linalg.norm(places - eye, axis=1)
-    return first < np.linalg.norm(points - eye, axis=1) - margin_m
+    return first < np.linalg.norm(points - eye, axis=1)

@@ -26,6 +26,42 @@ SHAPED = {
     "targets": {**IMAGES, "shape": ["surface", "volume"], "points": 20_000},
 }
 
+STUDIO = {
+    "scenes": 3,
+    "categories": ["box", "mug"],
+    "seed": 3,
+    "scene": "studio",
+    "studio": {"scale": "unit_cube", "size_m": 2.0},
+    "start": {"pose": "upright"},
+    "cameras": {
+        "sensor": {"width": 96, "height": 96, "fx": 100.0, "fy": 100.0, "cx": 48.0, "cy": 48.0},
+        "more": [
+            {
+                "name": "around",
+                "ring": {"count": 4, "inclination_rad": [-0.3, 0.8], "radius_m": 4.0},
+                "roll_deg": [-20, 20],
+            },
+            {"name": "near", "sphere": {"count": 2, "radius_m": 3.5}, "fov_deg": 60.0},
+            {"name": "right", "beside": "input", "offset_m": [0.25, 0.0, 0.0]},
+            {"name": "left", "beside": "input", "offset_m": [-0.125, 0.0, 0.0]},
+        ],
+    },
+    "targets": {"views": ["normals"]},
+    "run": {"range_size": 2},
+}
+
+
+@pytest.fixture(scope="session")
+def studio(tmp_path_factory) -> LocalStore:
+    """Three objects alone, each with a ring, two views of another lens, and cameras left and right of the input camera."""
+    return make_dataset(tmp_path_factory.mktemp("studio"), **STUDIO)[0]
+
+
+@pytest.fixture(scope="session")
+def studio_tars(tmp_path_factory) -> LocalStore:
+    """The same in tars."""
+    return make_dataset(tmp_path_factory.mktemp("studio"), output={"layout": "tar"}, **STUDIO)[0]
+
 
 @pytest.fixture(scope="session")
 def shaped(tmp_path_factory) -> LocalStore:

@@ -109,3 +109,15 @@ def test_captures_have_their_board_and_scenes_with_neither_shapes_nor_sources_ar
     shutil.rmtree(stored.root / "assets")
     manifest = export_to(stored, tmp_path / "none", "gltf").manifest
     assert (manifest["pairs"], manifest["left_out"]) == (0, {NO_SOURCES: 1})
+
+
+def test_a_studio_scene_is_its_object_and_every_camera_that_the_job_names(studio, tmp_path):
+    export_to(studio, tmp_path / "new", "gltf", last_scene=0)
+    (path,) = (tmp_path / "new").glob("*/000000.glb")
+    nodes = placed(read_glb(path)[0])
+    assert not any(name.startswith(("floor", "table")) for name in nodes)
+    views = [row for row in source_rows(studio.root, "views") if row["role"] == "around" and not row["scene_id"]]
+    for view in views:
+        T = Y_UP_FROM_Z_UP @ np.reshape(view["T_world_cam"], (4, 4)) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        np.testing.assert_allclose(nodes[f"around_{view['number']:03d} 0"], T, atol=1e-6)
+    assert len(views) == 4

@@ -18,12 +18,13 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
 @pytest.fixture(scope="module")
-def folder(files, shaped, tmp_path_factory):
+def folder(files, shaped, studio, tmp_path_factory):
     """A folder in which the page's commands were run."""
     place = tmp_path_factory.mktemp("page")
     (place / "data").mkdir()
     (place / "data" / "tabletop").symlink_to(files.name)
     (place / "data" / "targets").symlink_to(shaped.name)
+    (place / "data" / "studio").symlink_to(studio.name)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         for words in COMMANDS:
@@ -32,7 +33,7 @@ def folder(files, shaped, tmp_path_factory):
 
 
 def test_every_command_of_the_page_exports(folder):
-    assert len(COMMANDS) == 11 and "`--shard-mb` (256)" in PAGE
+    assert len(COMMANDS) == 15 and "`--shard-mb` (256)" in PAGE
     assert {words[words.index("--format") + 1] for words in COMMANDS} == set(FORMATS)
     for words in COMMANDS:
         assert (folder / words[2] / "export.json").exists() and not (folder / words[2] / "_export").exists()
@@ -65,6 +66,7 @@ def test_the_page_names_every_kind_of_file_that_an_export_writes(folder):
             if path.startswith("shapes/") or "/complete/" in path:
                 name = f"<instance_id>{path[-4:]}"
             name = re.sub(r"^0[0-9]\.pcd", "00.pcd", re.sub(r"^[0-9]{4}_", "0000_", name))
+            name = re.sub(r"^[0-9]{3}(?=[._])", "000", name)
             known = re.sub(r"^(segmentIn|depthIn)", "rgbIn", name)
             known = re.sub(r"#([._])(aligned|mirror|projected)\.", r"#\1input.", known)
             assert known in told, f"{words[2]}/{path}"

@@ -34,6 +34,7 @@ from workers.store.local import LocalStore
 
 SPLITS = ("train", "val", "test")
 OF = dict.fromkeys(("occnet", "nocs"), ("shaped", "shaped_tars"))
+OF |= dict.fromkeys(("zero123", "instantmesh", "trellis", "stereo"), ("studio", "studio_tars"))
 """Datasets that formats which need targets are tested on."""
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -169,7 +170,10 @@ def test_two_processes_do_not_write_one_export(tmp_path):
     )
     with subprocess.Popen([sys.executable, "-c", holder], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stdout.readline() == b"held\n"
-        with pytest.raises(InUseError, match="another export writes into"), ExportFolder(tmp_path / "new").claimed({}):
+        with (
+            pytest.raises(InUseError, match="another `verso export` writes"),
+            ExportFolder(tmp_path / "new").claimed({}),
+        ):
             pass
         process.kill()
     with ExportFolder(tmp_path / "new").claimed({}):

@@ -14,7 +14,10 @@ import pyarrow.dataset as ds
 import pytest
 import trimesh
 from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
+import verso
 from schemas.errors import AssetSourceError, MachineError, plural
 from schemas.job.assets import MeshLimits, ProceduralSource
 from services.cli.main import main
@@ -29,8 +32,8 @@ from services.init.shown import (
     draw_sheet,
     draw_table,
 )
-from services.job.job_file import load_job
-from tests.services.init.own_meshes import cup, mixed_folder, write_mesh
+from services.job.job_file import load_job, validate_job
+from tests.services.init.own_meshes import cup, mixed_folder, write_mesh, write_textured
 from tests.workers.door.oracles import write
 from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
@@ -39,11 +42,12 @@ from workers.assets.library.collection import OUTSIDE, SUFFIXES, walk_folder
 from workers.assets.library.copies import find_copies
 from workers.assets.library.placement import find_unit
 from workers.assets.library.reading import list_files
-from workers.assets.library.table import Row, read_table
+from workers.assets.library.table import PLAIN, Row, read_table
 from workers.door.meshes.mesh import transform_shape
 from workers.geometry.frames import pose
 from workers.render.raster.gbuffer import shared_renderer
 
+SMALL_SENSOR = {"width": 48, "height": 48, "fx": 52, "fy": 52, "cx": 24, "cy": 24}
 ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -150,7 +154,45 @@ def test_what_no_table_carries_is_asked_about_and_is_scaled_or_left_out_where_on
         objects = json.loads(told.splitlines()[-1])["objects"]
         sizes = {one["category"]: round(float(np.linalg.norm(one["extents_m"])), 3) for one in objects}
         assert (code, sizes) == (0, used), words
-        assert ("? " in told) == (asked is not None) and (asked or "") in told, told
+        assert ("\n  ? " in told) == (asked is not None) and (asked or "") in told, told
+
+
+def test_a_shape_without_picture_and_colour_is_told_of_wherever_it_is_used(tmp_path, capsys):
+    colours = {"grey": (128, 128, 128, 255), "red": (200, 30, 30, 255), "white": (255, 255, 255, 255)}
+    for name, colour in colours.items():
+        mesh = cup()
+        mesh.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=colour))
+        write_mesh(tmp_path / f"m/{name}/{name}.glb", mesh)
+    write_mesh(tmp_path / "m/bare/bare.stl", cup(0.2))
+    write_textured(tmp_path / "m/painted/painted.obj", cup(0.15))
+    code, told, _ = init(tmp_path / "m", "--out", tmp_path / "lib", "--json", capsys=capsys)
+    objects = {each["path"]: each["mended"] for each in json.loads(told.splitlines()[-1])["objects"]}
+    plain = sorted(path for path, notes in objects.items() if PLAIN in notes)
+    assert (code, plain, len(objects)) == (0, ["bare/bare.stl", "grey/grey.glb", "white/white.glb"], 5)
+    words = f"3 of 5 shapes: {PLAIN} ({', '.join(plain)})"
+    assert words in told
+    for folder in ("lib", "m"):  # a library, and a folder that nobody looked at
+        source = {"source": "library", "folder": folder}
+        job = validate_job({"name": "t", "categories": ["bare"], "assets": {"objects": [source]}}, "t")
+        assert any(words in line for line in open_catalogue(job.assets, tmp_path, ("bare",)).describe_doubts())
+
+
+def test_a_folder_becomes_a_studio_job_beside_that_of_the_table_with_things_of_any_size(tmp_path, capsys):
+    write_mesh(tmp_path / "m/tower/tower.glb", trimesh.creation.box((3.0, 3.0, 9.0)))
+    write_textured(tmp_path / "m/mug/mug.obj", cup())
+    for scene, name in (("studio", "studio.yaml"), ("tabletop", "job.yaml")):
+        code, told, _ = init(tmp_path / "m", "--out", tmp_path / "lib", "--scene", scene, "--json", capsys=capsys)
+        assert (code, json.loads(told.splitlines()[-1])["job"]) == (0, str(tmp_path / "lib" / name))
+        assert ("too large for a table. Run" in told) == (scene == "tabletop")
+    job = load_job(tmp_path / "lib/studio.yaml")
+    assert (job.scene, job.has_alpha, set(job.categories), job.name) == ("studio", True, {"tower", "mug"}, "m_studio")
+    small = [f"cameras.sensor.{key}={value}" for key, value in SMALL_SENSOR.items()]
+    pairs = [verso.make_scene(tmp_path / "lib/studio.yaml", number, small)[0] for number in range(6)]
+    assert {pair.category for pair in pairs} == {"tower", "mug"}
+    for pair in pairs:
+        assert np.linalg.norm(pair.mesh().vertices, axis=1).max() == pytest.approx(1.0, abs=1e-6)
+        covered = (pair.views("around").alpha() > 0).mean(axis=(1, 2))
+        assert len(covered) == 24 and 0.1 < covered.min() <= covered.max() < 0.5
 
 
 def test_a_disk_that_is_full_at_any_file_is_told_in_a_line_and_the_next_init_goes_on(tmp_path, capsys, monkeypatch):

@@ -83,6 +83,27 @@ def figures():
 
 
 @pytest.fixture(scope="package")
+def studio(tmp_path_factory) -> LocalStore:
+    """A finished studio scene with a ring, cameras all over a sphere, and one beside the input camera."""
+    cameras = {
+        "sensor": {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0},
+        "more": [
+            {"name": "around", "ring": {"count": 14, "inclination_rad": 0.4}},
+            {"name": "over", "sphere": {"count": 5, "pattern": "fibonacci"}},
+            {"name": "right", "beside": "input", "offset_m": [0.1, 0.0, 0.0]},
+        ],
+    }
+    changes = {
+        "scene": "studio",
+        "studio": {"scale": "unit_sphere"},
+        "scenes": 1,
+        "categories": ["mug"],
+        "images": {"patch": {"width": 8, "height": 6}},
+    }
+    return make_dataset(tmp_path_factory.mktemp("studio"), cameras=cameras, check={"raycast_share": 0.0}, **changes)[0]
+
+
+@pytest.fixture(scope="package")
 def targets(tmp_path_factory) -> LocalStore:
     """A finished scene of two objects with every image target."""
     changes = {"scenes": 1, "objects_per_scene": 2, "categories": ["mug"], "start": {"offset_m": [-0.12, 0.12]}}

@@ -17,9 +17,12 @@ from services.dataset.dataset import open_dataset
 from services.look import clouds as module
 from services.look.clouds import Body, Cloud, Space, coarsen, pack_spaces, read_space, read_spaces
 from services.look.pictures import (
+    CHEQUERS,
     FIXED_REGIONS,
+    GAP,
     MOST_WIDTH,
     OBJECT_REGIONS,
+    ROUND_MS,
     choose_scenes,
     depth_span,
     picture_of_codes,
@@ -33,7 +36,7 @@ from services.look.pictures import (
     view_pictures,
 )
 from services.look.sections import space_html
-from services.look.sheets import compare_html, sheets_html
+from services.look.sheets import compare_html, sheets_html, strip_html
 from services.read.dataset_reader import find_scene
 from tests.services.look.conftest import HOSTILE, Handmade, address, scene
 
@@ -73,8 +76,13 @@ def test_the_span_of_depth_leaves_out_what_is_unknown_and_rare_and_the_floor():
 
 
 def test_a_large_picture_is_shrunk_and_its_address_holds_its_bytes():
-    large = picture_of_colour(np.zeros((960, 1280, 3), np.uint8), "large")
-    assert (large.width, large.height) == (MOST_WIDTH, MOST_WIDTH * 3 // 4)
+    large = {
+        "rgb": np.zeros((960, 1280, 3), np.uint8),
+        "region": np.repeat(np.uint8([[3], [4]]), 480, 0).repeat(1280, 1),
+    }
+    shrunk = view_pictures("input", large, 5000.0)
+    assert {(each.width, each.height) for each in shrunk.values()} == {(MOST_WIDTH, MOST_WIDTH * 3 // 4)}
+    assert len(np.unique(decoded(shrunk["input region"]).reshape(-1, 3), axis=0)) == 2  # no region between two
     picture = picture_of_colour(np.zeros((12, 16, 3), np.uint8), "small")
     assert (picture.width, picture.height) == (16, 12)
     kind, _, data = picture.inline.partition(",")
@@ -126,6 +134,66 @@ def test_sheets_and_the_slider_show_each_scene_that_has_the_pictures_and_no_mark
     assert compare_html([scene(7, "mug", ("input rgb",))]) == ""
     hostile = [scene(3, HOSTILE), scene(4, "mug")]
     assert "<script" not in sheets_html(hostile, address) + compare_html(hostile)
+
+
+# ---------------------------------------------------------------------------------------------- named cameras
+
+
+def test_a_camera_is_a_strip_of_its_views_over_chequers_and_a_ring_turns(studio):
+    (pair, *_), (shown, *_) = open_dataset(studio.root).scene(0), show_scenes(studio, [0])[0]
+    around, over, right = shown.cameras
+    assert [(each.name, each.views, each.shown) for each in shown.cameras] == [
+        ("around", 14, 12),
+        ("over", 5, 5),
+        ("right", 1, 1),
+    ]
+    assert over.turning is None and right.turning is None and around.turning is not None
+    with Image.open(io.BytesIO(around.turning.data)) as moving:
+        assert (moving.format, moving.n_frames, moving.size) == ("WEBP", 14, (64, 48))
+        assert abs(14 * moving.info.get("duration", ROUND_MS // 14) - ROUND_MS) < 100
+        moving.seek(9)
+        last = np.asarray(moving.convert("RGB")).astype(int)
+    view, strip = pair.views["around", 9], decoded(around.strips["around rgb"])
+    covered, clear = view.alpha() == 255, view.alpha() == 0
+    assert np.abs(last - view.rgb())[covered].mean() < 12 and strip.shape == (2 * (48 + GAP), 6 * (64 + GAP), 3)
+    assert np.abs(strip[:48, :64] - pair.views["around", 0].rgb())[pair.views["around", 0].alpha() == 255].mean() < 12
+    low, high = np.percentile(last[clear], (2, 98))  # but for what the compression smears over the edge
+    assert min(CHEQUERS) - 12 < low < high < max(CHEQUERS) + 12
+    assert set(over.strips) == {"over rgb", "over depth", "over region"}
+    masks = [np.pad(view.segment(), ((0, GAP), (0, GAP))) for view in pair.views("over")]
+    colors = np.array([*FIXED_REGIONS, *OBJECT_REGIONS])
+    assert np.array_equal(decoded(over.strips["over region"]), colors[np.concatenate(masks, axis=1)])
+
+
+def test_the_sheet_and_the_small_strip_show_named_cameras_and_whole_pictures_where_there_is_no_mirror(studio):
+    (shown, *_), _ = show_scenes(studio, [0])
+    html = sheets_html([shown], address)
+    assert html.count('class="camera"') == 3 and html.count('data-name="turning"') == 1
+    assert "around <span>12 of 14 views" in html and "over <span>5 views" in html and "right <span>1 view<" in html
+    small = strip_html(shown, address)
+    assert small.count("<img ") == 4 and address(shown.cameras[0].turning) in small
+    assert strip_html(scene(3, "box"), address).count("<img ") == 2 and compare_html([shown]) == ""
+
+
+def test_an_object_alone_is_seen_from_farther_away_with_the_named_cameras_and_its_shape_made_again_has_its_size(studio):
+    space = read_space(studio, 0)
+    assert {body.kind for body in space.bodies} == {"object"} and space.missing == "" and len(space.cameras) == 20
+    vertices = np.concatenate([body.vertices for body in space.bodies])
+    radius_m = np.linalg.norm(vertices, axis=1).max()
+    assert radius_m == pytest.approx(1.0, abs=1e-5)
+    (packed,) = json.loads(pack_spaces([space]))
+    assert len(packed["cameras"]) == 20 and packed["far"] > 1.5 * radius_m
+    card = studio.read("DATASET.md").decode()
+    assert "| views of further cameras | around (14), over (5), right (1) |\n" in card and "Alpha is" in card
+    assert "tables, weight" not in card and "each alone on nothing" in card
+    (stored,) = studio.root.glob("assets/mug/*.glb")
+    kept = stored.read_bytes()
+    stored.unlink()
+    try:
+        again = np.concatenate([body.vertices for body in read_space(studio, 0).bodies])
+    finally:
+        stored.write_bytes(kept)
+    np.testing.assert_allclose(np.ptp(again, axis=0), np.ptp(vertices, axis=0), atol=1e-5)
 
 
 # ---------------------------------------------------------------------------------------------- targets

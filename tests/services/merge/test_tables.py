@@ -26,7 +26,7 @@ from services.merge.tables import describe_sources, escaped, object_lines
 from tests.made_up_datasets import FIRST, STOP, dataset_at, plain_rows
 from tests.made_up_scenes import attempt_at, failed_scene, fails, made_scene, terms
 from workers.assets.catalogue import Catalogue
-from workers.assets.library.table import Library, Row
+from workers.assets.library.table import PLAIN, Library, Row
 from workers.store.attempt import begin_attempt
 from workers.store.local import LocalStore
 from workers.store.manifest import table_of_rows
@@ -109,17 +109,20 @@ def test_a_name_with_spaces_is_one_word_and_can_be_had_back():
 def test_the_card_names_every_source_with_its_licence_and_what_was_left_out_of_it_or_is_doubtful():
     bad = Row("a.obj", category="mug", use=False, reason="no_faces", why="has no triangles")
     rows = [Row(f"{name}.glb", category="mug", licence="MIT", shape_up="y", sure=True) for name in "dcba"]
+    rows[1] = replace(rows[1], mended=(PLAIN,))
     library = Library(Path("/l"), Path("/meshes"), MeshLimits(), (bad, replace(bad, path="b.obj", why="..."), *rows))
     assets = Assets(
         objects=(LibrarySource(source="library", folder="l"), ProceduralSource(source="procedural", seed=7))
     )
     catalogue = Catalogue(assets, (library, None), (None,), "d" * 64)
-    objects, seeded, table, left_out = describe_sources(catalogue)
+    objects, seeded, table, left_out, plain = describe_sources(catalogue)
     assert objects == "objects, weight 1: library l, licences MIT (4)"
     assert seeded == "objects, weight 1: made from seed 7, licence CC0-1.0"
     assert table.startswith("tables, weight 1: made from seed")
     assert left_out == "left out of /meshes: 2 no_faces; a.obj (no_faces: has no triangles); b.obj (no_faces: ...)"
-    (line,) = catalogue.describe_doubts()
+    assert plain == f"/meshes: 1 of 4 shapes: {PLAIN} (c.glb)"
+    again, line = catalogue.describe_doubts()
+    assert again == plain
     doubts = "/meshes: files stand on another axis than `up` says: a.glb on y, b.glb on y, c.glb on y and 1 more"
     assert line.startswith(doubts) and "change `up` in its table" in line
     assert Catalogue(Assets(), (None,), (None,), "d" * 64).describe_doubts() == []

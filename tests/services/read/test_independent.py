@@ -198,7 +198,7 @@ WRONG = {
     "orbit": (
         camera.orbit_pose,
         lambda f: lambda centre, inclination, yaw, radius: f(centre, inclination, yaw, 0.99 * radius),
-        "does not look at the table's centre from cameras.orbit.radius_m",
+        "does not look at the table's centre",
     ),
     "yaw": (camera.yaw, lambda f: lambda T: -f(T), "is not the direction from the table to the camera"),
     "half a pixel in rendering": (

@@ -1,8 +1,13 @@
-"""Mutants of every prediction format: each is scored or refused in a line, within two seconds and a gigabyte, in silence."""
+"""Predictions of a stranger: mutants of every format, what is no file, and what takes too much memory or time.
+
+Each is scored or refused in a line, mutants within two seconds and a gigabyte, in silence, and what is beside it is scored.
+"""
 
 import io
 import json
+import os
 import random
+import re
 import shutil
 import struct
 import time
@@ -10,11 +15,14 @@ from functools import cache
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import trimesh
 
 from schemas.errors import InputError
+from services.cli.main import main
 from services.dataset.dataset import open_dataset
+from services.score import run as module
 from services.score.items import Asked, score_pair
 from services.score.predictions import find_predictions
 from services.score.run import _table
@@ -142,9 +150,9 @@ def write_mutants(root, kind, count, folder):
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """One scene with samples of its shape."""
+    """Five scenes with samples of their shapes."""
     targets = {"shape": ["volume"], "points": 500}
-    return str(make_dataset(tmp_path_factory.mktemp("hostile"), scenes=1, categories=["box"], targets=targets)[0].root)
+    return str(make_dataset(tmp_path_factory.mktemp("hostile"), scenes=5, categories=["box"], targets=targets)[0].root)
 
 
 @pytest.mark.parametrize("count", [30, pytest.param(1000, marks=(pytest.mark.slow, pytest.mark.timeout(3000)))])
@@ -165,3 +173,100 @@ def test_mutants_are_scored_or_refused_in_a_line_and_nothing_else(root, kind, co
         shutil.rmtree(folder)
     assert len(seconds) == count and ends["ok"] + ends["missing"] < count
     assert capfd.readouterr().err == ""
+
+
+def score_folder(root, folder):
+    """(exit status, status and reason of each item by kind and pose id; of one without a pose by kind and None)."""
+    status = main(["score", root, str(folder)])
+    rows = pq.read_table(folder / "score" / "items.parquet").to_pylist()
+    return status, {(row["kind"], row["pose_id"]): (row["status"], row["reason"]) for row in rows}
+
+
+def swell(path):
+    path.touch()
+    os.truncate(path, 6 << 30)
+
+
+IRREGULAR = {
+    "a pipe": (os.mkfifo, "is a pipe"),
+    "a folder": (os.mkdir, "is a folder"),
+    "a link to a device": (lambda path: path.symlink_to("/dev/zero"), "is a link out of"),
+    "a link to a file elsewhere": (lambda path: path.symlink_to(path.parents[2] / "elsewhere"), "is a link out of"),
+    "a link to nothing": (lambda path: path.symlink_to("nowhere"), "No such file"),
+    "a link to itself": (lambda path: path.symlink_to(path.name), "symbolic links"),
+    "six gigabytes": (swell, "no more are read"),
+}
+"""How it is made, and what is said of it."""
+
+
+@pytest.mark.parametrize(("make", "told"), IRREGULAR.values(), ids=IRREGULAR)
+def test_what_is_no_file_of_the_folder_is_refused_in_every_format(root, make, told, tmp_path):
+    pair, _, truth = pair_of(root)
+    folder, kinds = tmp_path / "given", {kind.partition(" ")[0] for kind in FORMATS} - {"pose"}
+    waiting = {kind: [other.mirror.pose_id for other in open_dataset(root).pairs()][1:] for kind in kinds}
+    (folder / "kept").mkdir(parents=True)
+    (tmp_path / "elsewhere").write_bytes(truth["depth .npy"])
+    expected = {}
+    for name in FORMATS:
+        kind, suffix = name.split(" ")
+        if kind == "pose":
+            make(folder / "poses.csv")
+            continue
+        (folder / kind).mkdir(exist_ok=True)
+        expected[kind, waiting[kind][0]] = "refused"
+        make(folder / kind / f"{waiting[kind].pop(0)}{suffix}")
+    for kind, suffix in {
+        "depth": ".npy",
+        "rgb": ".png",
+        "shape": ".ply",
+        "volume": ".npy",
+    }.items():  # links, but inside
+        (folder / "kept" / kind).write_bytes(truth[f"{kind} {suffix}"])
+        (folder / kind / f"{pair.mirror.pose_id}{suffix}").symlink_to(f"../kept/{kind}")
+        expected[kind, pair.mirror.pose_id] = "ok"
+    status, items = score_folder(root, folder)
+    assert (status, items["pose", None][0]) == (1, "unknown")
+    assert {key: end for key, (end, _) in items.items() if end in ("ok", "refused")} == expected
+    reasons = [why for end, why in items.values() if end in ("refused", "unknown")]
+    assert len(reasons) == len(FORMATS) and all(told in why and why.isprintable() for why in reasons)
+
+
+def slow(mesh):
+    """An open sheet of 700,000 faces about a box."""
+    size, (low, high) = 600, mesh.bounds
+    y, x = np.indices((size, size)).reshape(2, -1) / (size - 1)
+    vertices = low + (high - low) * np.column_stack([x, y, 0.2 * np.sin(9.0 * x)])
+    corner = np.arange(size * size).reshape(size, size)
+    a, b, c, d = (corner[i : size - 1 + i, j : size - 1 + j].ravel() for i in (0, 1) for j in (0, 1))
+    faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([b, d, c])])
+    return ".ply", trimesh.Trimesh(vertices, faces, process=False).export(file_type="ply")
+
+
+def hungry(mesh):
+    """A mesh with nine million texture coordinates, which no count limits."""
+    return ".obj", mesh.export(file_type="obj").encode() + b"\nvt 0 0" * 9_000_000
+
+
+@pytest.mark.parametrize(
+    ("limit", "most", "spoil", "told"),
+    [
+        ("MOST_MIB", 1024, hungry, "more (memory than there is|than 1024 MiB of memory): make it smaller"),
+        ("MOST_CPU_S", 1.5, slow, "takes more than 1.5 s of processor time: make it smaller"),
+    ],
+)
+def test_an_item_beyond_a_limit_is_refused_and_all_others_are_scored(
+    root, limit, most, spoil, told, tmp_path, monkeypatch
+):
+    """Also what is predicted of the same pose, and whatever the item is: within the limits it would be scored."""
+    deadly = 5
+    for kind in ("depth", "shape"):
+        (tmp_path / kind).mkdir()
+    for pair in open_dataset(root).pairs():
+        pose_id, mesh = pair.mirror.pose_id, pair.mesh(3, welded=True).apply_transform(np.linalg.inv(pair.T_world[3]))
+        np.save(tmp_path / "depth" / f"{pose_id}.npy", pair.mirror.depth() / pair.mirror.depth_units_per_m)
+        suffix, data = spoil(mesh) if pose_id == deadly else (".ply", mesh.export(file_type="ply"))
+        (tmp_path / "shape" / f"{pose_id}{suffix}").write_bytes(data)
+    monkeypatch.setattr(module, limit, most)
+    status, items = score_folder(root, tmp_path)
+    assert status == 1 and re.search(told, items.pop(("shape", deadly))[1])
+    assert {end for end, _ in items.values()} == {"ok"} and len(items) == 9

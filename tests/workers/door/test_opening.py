@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from schemas.errors import CaptureError, InputError, JobError, MeshError
-from workers.door.opening import as_refusal, open_file, read_bytes
+from workers.door.opening import COPY_AGAIN, as_refusal, open_file, read_bytes
 
 CAP = 1000
 
@@ -116,16 +116,16 @@ def test_every_decoders_error_is_a_refusal_of_that_file(decoder):
 
 def test_a_refusal_says_what_is_wrong_and_no_address_in_memory():
     cases = {
-        "it takes more memory than there is": MemoryError(),
-        "Input/output error": OSError(5, "Input/output error"),
-        "ValueError('bad value')": ValueError(f"bad{object()} value"),
-        r"ValueError('a\nb')": ValueError("a\nb"),
+        "it takes more memory than there is: make it smaller": MemoryError(),
+        f"Input/output error: {COPY_AGAIN}": OSError(5, "Input/output error"),
+        f"ValueError('bad value'): {COPY_AGAIN}": ValueError(f"bad{object()} value"),
+        rf"ValueError('a\nb'): {COPY_AGAIN}": ValueError("a\nb"),
     }
     for what, error in cases.items():
         with pytest.raises(MeshError) as refusal, as_refusal("a.obj", MeshError):
             raise error
         assert refusal.value.reason == "unreadable"
-        assert refusal.value.detail == f"a.obj cannot be read: {what}: copy it again, or make it anew"
+        assert refusal.value.detail == f"a.obj cannot be read: {what}"
 
 
 def test_our_own_errors_and_those_that_stop_the_program_pass():

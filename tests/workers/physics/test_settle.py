@@ -374,6 +374,35 @@ def test_a_pile_of_more_than_eight_falls_in_waves_above_what_lies(monkeypatch):
         assert [heights.min() for heights in wave[lying:]] == pytest.approx(tops[:-1] + 0.04, abs=1e-9)
 
 
+@pytest.mark.parametrize(("bodies", "most"), [(("bowl", "bowl"), 100), (("mug", "box"), 1000)])
+def test_only_thin_walls_that_may_lie_in_one_another_fall_as_coarser_parts(bodies, most, monkeypatch):
+    """A bowl has a thousand parts, each compared with all of the other's; a mug has four hundred, a box three."""
+    given, usual = [], releasing.fall
+
+    def noted(things, *more):
+        given.append([len(thing.parts) for thing in things])
+        return usual(things, *more)
+
+    monkeypatch.setattr(releasing, "fall", noted)
+    starts = [at(built_in(name), TABLE, (0.0, 0.0, 0.2 + 0.3 * k), LEANS) for k, name in enumerate(bodies)]
+    settle_group(together(TABLE, starts).starts, TABLE, PHYSICS)
+    assert given and all(most / 10 < max(counts) < most for counts in given)
+
+
+def test_six_cups_come_to_rest_one_after_the_other_and_only_neighbours_are_compared_when_let_go(monkeypatch):
+    """A cup's wall is in the box of each cup within its height, and touches those of the next alone. Here they stay."""
+    apart = []
+
+    def stayed(bodies, poses, *more, **named):
+        apart.append(set(more[4].apart))
+        return Outcome(tuple(poses), 0.0, 0.0, True)
+
+    monkeypatch.setattr(holding, "fall", stayed)
+    group = cups(6)
+    settle_group(group.starts, group.table, PHYSICS)
+    assert apart == [{(i, j) for j in range(6) for i in range(j - 1)}]
+
+
 def test_letting_go_ends_at_its_budget_and_names_the_objects(monkeypatch):
     monkeypatch.setattr(settle, "LET_GO_COST", 0.0)
     group = cups(2)

@@ -100,6 +100,14 @@ def test_worlds_have_the_same_bits_whatever_was_simulated_before_and_whether_the
             assert ended(*drops[number]) == expected[number]
 
 
+def test_bodies_that_are_kept_apart_pass_through_one_another_and_those_of_the_next_world_do_not():
+    body = body_of(box(0.1, 0.1, 0.1))
+    for apart, height_m in (((), 0.15), (((0, 1),), 0.05), ((), 0.15)):
+        poses = [at(0.0, 0.05), at(0.0, 0.16)]
+        ended = fall([body, body], poses, 0.0, PHYSICS, StepSizes(960, 1e-3), 0.0, Watch(apart=apart)).poses
+        assert ended[1][2, 3] == pytest.approx(height_m, abs=1e-3)
+
+
 @pytest.mark.minute
 def test_worlds_come_and_go_without_their_memory_staying():
     run = [sys.executable, "-c", GROWTH]

@@ -41,6 +41,7 @@ from tests.workers.render.random_scenes import (
     with_material,
     without,
 )
+from workers.assets.appearance import STUDIO_LIGHTS
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import decode_srgb, encode_srgb
 from workers.geometry.frames import translation
@@ -68,6 +69,27 @@ def test_a_white_plane_under_one_light_is_as_bright_as_lambert_says(renderer):
         light = Light(frozen_array([np.sin(angle), 0.0, np.cos(angle)]), (0.75, 0.75, 0.75))
         seen = renderer.draw([white_floor()], Appearance(BLACK, (light,), BLACK), view, *RASTER)
         assert brightness(seen.rgb)[16, 16] == pytest.approx(0.75 * np.cos(angle), rel=0.02), f"at {angle} rad"
+
+
+@pytest.mark.parametrize("light", sorted(STUDIO_LIGHTS))
+def test_light_of_a_studio_shows_the_shape_of_a_white_ball_and_draws_no_line_along_its_outline(renderer, light):
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5)
+    part = Part(
+        "ball", frozen_array(ball.vertices), frozen_array(ball.faces, np.int32), Material((1.0,) * 4, roughness=0.3)
+    )
+    shape = Shape((replace(part, normals=frozen_array(ball.vertices / 0.5)),))
+    alone = without(RASTER, "shadows", "ambient_occlusion", "light_maps")
+    for yaw in np.arange(4) * math.pi / 2:
+        view = camera(small(400, 400), orbit_pose(np.zeros(3), 0.0, yaw, 1.2))
+        seen = renderer.draw([Placed(3, shape, np.eye(4))], STUDIO_LIGHTS[light], view, *alone)
+        light_of = brightness(seen.rgb)
+        rows, columns = np.nonzero(seen.region == 3)
+        across = light_of[200, columns[rows == 200]]
+        down = light_of[rows[columns == 200], 200]
+        assert seen.rgb[seen.region == 3].max() < 254, "nothing is clipped"
+        assert down.max() > 1.3 * down.min(), "it is no disc"
+        if light != "three_point":  # whose lights stand on one side
+            assert across.max() < 1.15 * across[len(across) // 2]
 
 
 @pytest.mark.parametrize("level_m", [0.0, 0.6], ids=["on the floor", "on a table"])

@@ -198,7 +198,7 @@ STANDING = np.eye(4)
 STANDING[2, 3] = 2.0
 
 
-def row(change: tuple[int, int, float] | None = None, **more: object) -> dict[str, object]:
+def row(change: tuple[int, int, float] | None = None, /, **more: object) -> dict[str, object]:
     """A row of a table, with one number changed."""
     T = STANDING.copy()
     if change is not None:

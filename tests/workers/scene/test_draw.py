@@ -68,9 +68,7 @@ def test_a_stream_is_a_function_of_seed_scene_step_and_object():
     assert sensors[0].random() == chance.stream(Stream.SENSOR_EXPOSURE, 3).random()
     assert sensors[1].random() != sensors[2].random() != chance.stream(Stream.SENSOR, 3).random()
     names = "CATEGORY OBJECT TABLE START REDRAW CAMERA APPEARANCE RAYCAST_CHECK SENSOR_DEPTH SENSOR_RGB SENSOR_EXPOSURE"
-    names += (
-        " PATHS COUNT HIDDEN_MARKERS MOTION HELD_OUT LOST SENSOR ORBIT MORE"  # append-only: numbers are in datasets
-    )
+    names += " PATHS COUNT HIDDEN_MARKERS MOTION HELD_OUT LOST SENSOR ORBIT MORE MIRROR"  # append-only: numbers are in datasets
     assert [(stream.name, int(stream)) for stream in Stream] == [(name, n) for n, name in enumerate(names.split())]
 
 
@@ -178,7 +176,13 @@ NEAR_DEPTH = {"images": {"depth_range_m": [0.05, 8.0]}}
 
 def test_framed_objects_cover_their_share_wherever_they_rest_unless_the_edges_or_the_range_of_depth_forbid_it():
     picture = 640 * 480
-    for radius, text, share in ((0.015, "fit", 0.06), (0.1, "fit", 0.06), (0.1, "3%", 0.03), (0.6, "10 %", 0.1)):
+    for radius, text, share in (
+        (0.015, "fit", 0.06),
+        (0.1, "fit", 0.06),
+        (0.1, "3%", 0.03),
+        (0.6, "10 %", 0.1),
+        (0.1, "30%", 0.3),
+    ):
         camera, seen, _ = framed(asset_of(trimesh.creation.icosphere(4, radius)), radius_m=text, **NEAR_DEPTH)
         u, v = project(seen, camera.intrinsics)
         middle = 0.5 * (

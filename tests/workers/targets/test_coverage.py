@@ -1,5 +1,7 @@
 """Alpha of studio scenes against many rays a pixel through the mesh itself, by another library; and the colour beneath it."""
 
+from typing import cast
+
 import numpy as np
 import pytest
 import trimesh
@@ -28,7 +30,7 @@ def needles() -> trimesh.Trimesh:
         rod = trimesh.creation.cylinder(radius=0.0012, height=0.6, sections=5)
         rod.apply_transform(trimesh.transformations.rotation_matrix(0.26 * number, [1.0, 0.3, 0.2]))
         rods.append(rod)
-    return trimesh.util.concatenate([*rods, box(0.1, 0.1, 0.1)])
+    return cast(trimesh.Trimesh, trimesh.util.concatenate([*rods, box(0.1, 0.1, 0.1)]))
 
 
 MESHES = {

@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from schemas.base import Array
 from schemas.job.assets import UpAxis
 from schemas.scene.shape import MassProperties, Shape
+from workers.assets.library.table import PLAIN
 from workers.assets.samples import colors_at, draw_points
 from workers.door.meshes.dae import find_up
 from workers.door.meshes.raw import DEFAULT
@@ -136,6 +137,9 @@ def _depth_inside(points: Array, point: Array) -> float:
 PLACEHOLDER_PX = 2
 """Side of the grey picture that trimesh gives a mesh whose material is missing."""
 
+SAME_GREY = 0.02
+"""Red, green and blue of a grey differ by less."""
+
 
 @dataclass(frozen=True)
 class Measured:
@@ -175,7 +179,7 @@ def measure_shape(
         faces=len(shape.faces),
         watertight=mass.solid,
         textures=len({id(texture) for texture in textures if max(texture.shape[:2]) > PLACEHOLDER_PX}),
-        notes=notes,
+        notes=(*notes, PLAIN) if is_plain(shape) else notes,
         up=None if fits is None else fits.axis,
         confidence=None if fits is None else fits.confidence,
         area=0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()),
@@ -190,6 +194,16 @@ def read_measured(tree: dict[str, Any]) -> Measured:
     """The measures of `asdict`'s tree from JSON. Raises TypeError or KeyError where it is none."""
     look = None if tree["look"] is None else tuple(tree["look"])
     return Measured(**{**tree, "extents": tuple(tree["extents"]), "notes": tuple(tree["notes"]), "look": look})
+
+
+def is_plain(shape: Shape) -> bool:
+    """Whether all of a shape has one grey: its files give it no picture and no colour, or what a program writes by default."""
+    greys = {part.material.base_color[:3] for part in shape.parts}
+    pictures = (part.material.texture for part in shape.parts if part.material.texture is not None)
+    bare = all(part.colors is None for part in shape.parts) and all(
+        max(p.shape[:2]) <= PLACEHOLDER_PX for p in pictures
+    )
+    return bare and len(greys) == 1 and float(np.ptp(next(iter(greys)))) < SAME_GREY
 
 
 LOOK_SIDE, LOOK_SAMPLES = 4, 1 << 15

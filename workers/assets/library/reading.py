@@ -17,7 +17,7 @@ from scipy.spatial import QhullError
 
 from schemas.base import Array, frozen_array
 from schemas.errors import MachineError, MeshError, plain_line
-from schemas.job.assets import TABLE, Assets, MeshLimits
+from schemas.job.assets import TABLE, USUAL_DENSITY, Assets, MeshLimits
 from schemas.scene.shape import Asset, Shape
 from workers.assets.glb import asset_glb
 from workers.assets.library.placement import INFO_FILE, measure_shape, measure_thinness
@@ -190,7 +190,7 @@ def place_asset(loaded: LoadedMesh, row: Row, limits: MeshLimits) -> Asset:
     _check_size(row.path, scale * diagonal, limits)
     centre = 0.5 * (lower + upper) * scale
     shape = transform_shape(rotated, pose(scale * np.eye(3), -centre))
-    mass, common_m3 = weigh(shape, USUAL.density_kg_m3, USUAL.shell_kg_m2)
+    mass, common_m3 = weigh(shape, USUAL_DENSITY, USUAL.shell_kg_m2)
     return Asset(
         instance_id=row.instance_id,
         category=row.category,

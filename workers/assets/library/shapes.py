@@ -12,7 +12,7 @@ import numpy as np
 
 from schemas.base import frozen_array
 from schemas.errors import MeshError, OutputError
-from schemas.job.assets import TABLE, Assets, LibrarySource
+from schemas.job.assets import TABLE, USUAL_DENSITY, Assets, LibrarySource
 from schemas.scene.shape import Asset, MassProperties, Shape
 from workers.assets.glb import read_shape
 from workers.assets.library.reading import (
@@ -22,7 +22,7 @@ from workers.assets.library.reading import (
     describe_refusal,
     refusal_of,
 )
-from workers.assets.library.table import Library, Row, write_whole
+from workers.assets.library.table import PLAIN, Library, Row, write_whole
 from workers.door.meshes.mesh import transform_shape
 from workers.geometry.frames import pose
 from workers.pool import Answers
@@ -132,7 +132,8 @@ def load_shape(library: Library, row: Row, settings: LibrarySource, assets: Asse
         lower, upper = shape.bounds
         factor = settings.diagonal_m / float(np.linalg.norm(upper - lower))
         shape = transform_shape(shape, pose(factor * np.eye(3), np.zeros(3)))
-    mass = _weighed(kept, factor, assets)
+    density = assets.density_of(row.category)
+    mass = _weighed(kept, factor, density, assets.shell_kg_m2)
     T = np.array(kept["T_source_to_object"])
     T[:3, 3] *= factor
     return Asset(
@@ -147,19 +148,16 @@ def load_shape(library: Library, row: Row, settings: LibrarySource, assets: Asse
         T_source_to_object=frozen_array(T),
         scale=float(kept["scale"]) * factor,
         watertight=mass.solid,
-        volume_m3=mass.mass_kg / assets.density_kg_m3 if mass.solid else None,
+        volume_m3=mass.mass_kg / density if mass.solid else None,
         shareable=settings.copy_assets,
         notes=tuple(str(note) for note in kept["notes"]),
     )
 
 
-def _weighed(kept: dict[str, Any], factor: float, assets: Assets) -> MassProperties:
+def _weighed(kept: dict[str, Any], factor: float, density_kg_m3: float, shell_kg_m2: float) -> MassProperties:
     """The mass properties of a shape enlarged by a factor: a solid's mass goes with its cube, a shell's with its square."""
     mass_kg, com, inertia, solid = kept["mass"]
-    if solid:
-        more = assets.density_kg_m3 / USUAL.density_kg_m3 * factor**3
-    else:
-        more = assets.shell_kg_m2 / USUAL.shell_kg_m2 * factor**2
+    more = density_kg_m3 / USUAL_DENSITY * factor**3 if solid else shell_kg_m2 / USUAL.shell_kg_m2 * factor**2
     return MassProperties(
         mass_kg * more, frozen_array(np.array(com) * factor), frozen_array(np.array(inertia) * more * factor**2), solid
     )
@@ -178,10 +176,10 @@ def with_shape(library: Library, row: Row, made: bytes | MeshError) -> Row:
         faces=kept["faces"],
         watertight=kept["watertight"],
         pictures=kept["pictures"],
-        mended=tuple(kept["notes"]),
+        mended=(*kept["notes"], *(note for note in row.mended if note == PLAIN)),
         scale=kept["scale"],
         mass_kg=kept["mass"][0],
-        volume_m3=kept["mass"][0] / USUAL.density_kg_m3 if kept["mass"][3] else None,
+        volume_m3=kept["mass"][0] / USUAL_DENSITY if kept["mass"][3] else None,
         glb=row.glb_path,
         glb_bytes=len(made),
         glb_sha256=hashlib.sha256(made).hexdigest(),

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from schemas.errors import AssetSourceError, OutputError, plain_line
+from schemas.errors import AssetSourceError, OutputError, plain_line, plural
 from schemas.job.assets import TABLE, MeshLimits, UpAxis, is_usable
 
 TABLE_FILE = "library.parquet"
@@ -23,6 +23,9 @@ SHAPES = "shapes"
 
 VERSION = 1
 """Of a library: raised where an older one cannot be read as it is."""
+
+PLAIN = "no picture and no colour, drawn in one grey"
+"""A note on a shape."""
 
 UNKNOWN = "unknown"
 """The licence of shapes of which nobody states one."""
@@ -162,6 +165,18 @@ class Library:
     def doubts(self) -> Mapping[str, str]:
         """By path, the axis on which alone a file stands where `up` names another."""
         return {row.path: str(row.shape_up) for row in self.rows if row.use and row.sure and row.shape_up != row.up}
+
+    @property
+    def plain(self) -> list[str]:
+        """A sentence on the shapes that no file gives a picture or a colour; none where all have one."""
+        used = [row for row in self.rows if row.use and row.category not in ("", TABLE)]
+        plain = [row.path for row in used if PLAIN in row.mended]
+        some = f" and {len(plain) - EXAMPLES} more" if len(plain) > EXAMPLES else ""
+        return (
+            [f"{len(plain)} of {plural(len(used), 'shape')}: {PLAIN} ({', '.join(plain[:EXAMPLES])}{some})"]
+            if plain
+            else []
+        )
 
     @property
     def licences(self) -> Counter[str]:

@@ -86,10 +86,11 @@ class Program:
         gl.glUniform3fv(self._location("light_color"), count, lights.color)
 
     def set_ambience(self, appearance: Appearance, T_cam_world: Pose) -> None:
-        """Set, for tier raster, the world's up, the light from below, and the units of the light maps."""
+        """Set, for tier raster, the world's up, the light from below, the sheen, and the units of the light maps."""
         gl = self._gl
         gl.glUniform3f(self._location("up"), *T_cam_world[:3, 2])
         gl.glUniform3f(self._location("below"), *appearance.below)
+        gl.glUniform1f(self._location("sheen"), appearance.sheen)
         gl.glUniform1i(self._location("level_map"), LEVEL_UNIT)
         gl.glUniform1i(self._location("shadow_map"), SHADOW_UNIT)
 

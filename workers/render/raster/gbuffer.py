@@ -35,7 +35,7 @@ from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FLOOR, Appearance
 from schemas.scene.view import Camera, GBuffer, Intrinsics
 from workers.geometry.frames import invert
-from workers.geometry.pixels import fill_plane_depth, fourth_channel, spread_colours
+from workers.geometry.pixels import fill_plane_depth, fourth_channel, is_inner
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
 from workers.render.raster.context import (
@@ -194,8 +194,6 @@ class Renderer:
         if ground is not None:
             fill_plane_depth(depth_m, region, REGION_FLOOR, ground, view.k)
         if rgb is not None:
-            if effects.runs("alpha"):  # else edges are blended with a background that is not there
-                spread_colours(rgb, region)
             self._refine(rgb, region, things, view, render.samples)
             rgb.setflags(write=False)
         self._scene_size = len(things)
@@ -290,6 +288,8 @@ class Renderer:
         if not view.effects.runs("antialiasing"):
             return
         mask = find_edges(rgb, region)
+        if view.effects.runs("alpha"):
+            mask[~is_inner(region)] = 0  # alpha has the outline: a blend with what is behind would darken it
         if not view.effects.runs("samples"):
             smooth_edges(rgb, mask)
             return

@@ -112,6 +112,7 @@ vec2 arriving(float facing) {
 }
 
 #if !PLANAR
+uniform float sheen;               // share of Fresnel's mirrored light at grazing angles that is drawn
 // Lambert, GGX's lobe as in the flat tier with Schlick's Fresnel, and a sky over a ground (hemispherical ambient).
 vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float roughness) {
     vec2 arrives = arriving(dot(normal, v_light_towards[0]));
@@ -120,7 +121,7 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
     vec3 mirror = mix(vec3(0.04), albedo, metallic);
     vec3 around = mix(v_below, v_ambient, 0.5 + 0.5 * dot(normal, v_up)) * open;
     float facing = clamp(dot(normal, towards_eye), 0.0, 1.0), miss_eye = 1.0 - facing;
-    float grazing = miss_eye * miss_eye * miss_eye * miss_eye * miss_eye * (1.0 - roughness);
+    float grazing = miss_eye * miss_eye * miss_eye * miss_eye * miss_eye * (1.0 - roughness) * sheen;
     mirror += (1.0 - mirror) * grazing;
     float width = max(roughness * roughness * roughness * roughness, 0.002);
     vec3 bounced = 2.0 * dot(normal, towards_eye) * normal - towards_eye;
@@ -183,12 +184,15 @@ flat out vec3 v_plane_mirror;
 #else
 flat out vec3 v_ambient;
 flat out vec3 v_tinted;            // part of the mirrored light that a texel tints
-flat out vec4 v_gloss;             // untinted part of it, 1 - roughness, offset of the lobes, cosine of the key light
+flat out vec4 v_gloss;             // untinted part of it, (1 - roughness) sheen, offset of the lobes, cosine of the key light
 flat out vec3 v_lobe[LIGHTS];      // mirrored lights, scaled to the lobe
 flat out vec3 v_gain[LIGHTS];
 #if RASTER
+uniform float sheen;
 flat out vec3 v_below;
 flat out vec3 v_mirrored_up;
+#else
+const float sheen = 1.0;
 #endif
 #endif
 
@@ -212,7 +216,7 @@ void light_plane() {
     float width = max(roughness * roughness * roughness * roughness, 0.002);
     v_ambient = ambient;
     v_tinted = albedo_roughness.rgb * metallic;
-    v_gloss = vec4(0.04 * (1.0 - metallic), 1.0 - roughness, 0.5 + 0.5 / width, dot(normal, light_towards[0]));
+    v_gloss = vec4(0.04 * (1.0 - metallic), (1.0 - roughness) * sheen, 0.5 + 0.5 / width, dot(normal, light_towards[0]));
     for (int i = 0; i < LIGHTS; ++i) {
         float cosine = dot(normal, light_towards[i]);
         v_lobe[i] = (0.5 - 0.5 / width) * (light_towards[i] - 2.0 * cosine * normal);
