@@ -323,7 +323,7 @@ def _audit_scene(context: WorkerContext, store: Store, scene_id: int, audited: A
     audited.bytes += sum(len(file.data) for file in output.files)
     plain = None if audited.same_stack else make_forced(context, scene_id)[1]
     proven = _prove_no_ops(context, lambda now: _differences(store, stored, plain, now), output, no_ops, audited)
-    if approximations and scene.plan.ground is not None:  # nothing rests in a studio scene
+    if approximations:
         facts = Facts(context.job, scene.plan, scene.raycast_checked)
         effects = plan_effects(facts, names_of_kind("approximation"))
         motion = measure_motion(context, scene, effects)
