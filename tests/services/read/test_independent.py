@@ -251,7 +251,7 @@ def only_named(f: Callable, **changes: Callable) -> Callable:
     return planted
 
 
-def no_alpha_inside(rgb, alpha):
+def no_alpha_inside(rgb, region, alpha):
     return np.dstack([rgb, np.where(alpha == 255, 0, alpha)])
 
 
