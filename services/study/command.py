@@ -140,6 +140,11 @@ def refuse_unmeasured(job: Job, targets: Targets, missing: str | None) -> None:
 
 def make_plan(asked: Job, options: argparse.Namespace, targets: Targets | None) -> tuple[Plan, list[str]]:
     """The plan for these options, and what is left out, and why. Raises InputError."""
+    if asked.scene == "studio":
+        raise InputError(
+            "scene is studio: nothing falls, rests or casts a shadow, so no error is traded for time: ask for scenes on a "
+            "table, or for captures"
+        )
     missing = colour_truth_missing()
     refuse_unmeasured(asked, targets or {}, missing)
     if (captures := asked.captures) is None:

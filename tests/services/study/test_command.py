@@ -185,6 +185,8 @@ def test_captures_without_truth_and_targets_that_a_job_cannot_have_are_refused()
     options = SimpleNamespace(knobs=None, workers=1, job=Path("job.yaml"), budget=60.0)
     with pytest.raises(InputError, match=r"captures\.folders"):
         command.make_plan(job_of({"folders": ["a", "b"]}), options, None)
+    with pytest.raises(InputError, match="scene is studio"):
+        command.make_plan(Job(name="t", scene="studio"), options, None)
     with pytest.raises(InputError, match="the job is one of captures"):
         refuse_unmeasured(job_of({}), {"depth_mm": 0.1}, None)
     with pytest.raises(InputError, match=r"extra pathtraced"):
