@@ -12,7 +12,7 @@ from schemas.job.assets import CATEGORIES
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
 from schemas.scene.view import Camera
-from tests.effects.cases import NO_OPS, TARGETS
+from tests.effects.cases import NO_OPS, OF_OTHERS
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.random_physics import needed, random_physics
 from tests.effects.scenes import Setting, facts_of, make, with_holes, without_textures
@@ -104,7 +104,7 @@ def test_the_plan_chooses_rightly_on_random_scenes(scenes):
         except SceneError:
             continue
         plan, wanted = plan_effects(facts), called_for(facts)
-        assert {*plan.ran, *plan.skipped} == {effect.name for effect in EFFECTS}.difference(TARGETS)
+        assert {*plan.ran, *plan.skipped} == {effect.name for effect in EFFECTS}.difference(OF_OTHERS)
         for name in names_of_kind("no_op"):
             assert plan.runs(name) or name not in wanted, f"scene {number} needs {name}"
             left_out[name] += not plan.runs(name)
