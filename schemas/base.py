@@ -8,7 +8,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field
 
 Array = NDArray[np.float64]
 """A float64 array; the docstring that uses it gives the shape."""
@@ -62,13 +62,23 @@ Folder = Annotated[str, Field(max_length=4000), AfterValidator(_plain)]
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
-VALUE_KINDS = ("[word]", "[list]", "[number]")
-"""Marks of the kinds of value that a key may have, of which an error is told of the right one."""
+VALUE_KINDS: Mapping[str, tuple[type, ...]] = {
+    "[word]": (str,),
+    "[list]": (list, tuple),
+    "[map]": (dict,),
+    "[number]": (object,),
+}
+"""Marks of the kinds of value that a key may have, of which an error is told of the right one; anything else is a number."""
 
 
-def value_kind(value: object) -> str:
-    """The mark of a value's kind."""
-    return "[word]" if isinstance(value, str) else "[list]" if isinstance(value, list | tuple) else "[number]"
+def among_kinds(*kinds: str) -> Discriminator:
+    """Chooses among the kinds that a key may have by that of its value; the first of them for a value of another kind."""
+
+    def kind_of(value: object) -> str:
+        kind = next(name for name, types in VALUE_KINDS.items() if isinstance(value, types))
+        return kind if kind in kinds else kinds[0]
+
+    return Discriminator(kind_of)
 
 
 Share = Annotated[float, Field(ge=0, le=1)]

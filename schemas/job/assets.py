@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import AfterValidator, Field, Tag, field_validator, model_validator
 
-from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Weight
+from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Weight, among_kinds
 from schemas.errors import did_you_mean
 
 TABLE = "table"
@@ -281,9 +281,8 @@ USUAL_DENSITY = 600.0
 
 
 Density = Annotated[
-    Annotated[Positive, Tag("[number]")]
-    | Annotated[dict[CategoryName, Positive], Field(min_length=1), Tag("[by category]")],
-    Discriminator(lambda value: "[by category]" if isinstance(value, dict) else "[number]"),
+    Annotated[Positive, Tag("[number]")] | Annotated[dict[CategoryName, Positive], Field(min_length=1), Tag("[map]")],
+    among_kinds("[number]", "[map]"),
 ]
 
 

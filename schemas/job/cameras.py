@@ -5,9 +5,9 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, Tag, field_validator, model_validator
 
-from schemas.base import Folder, Frozen, Interval, Range, ordered, value_kind
+from schemas.base import Folder, Frozen, Interval, Range, among_kinds, ordered
 
 FocalLength = Annotated[float, Field(ge=1e-3, le=1e6)]
 PrincipalPoint = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -26,35 +26,28 @@ def _read_share(text: str) -> str:
     return text
 
 
-ReachRange = Annotated[tuple[Reach, Reach], AfterValidator(lambda ends: ordered(Range(*ends)))]
+_ORDERED = AfterValidator(lambda ends: ordered(Range(*ends)))
 Framed = Annotated[
     Annotated[Reach, Tag("[number]")]
-    | Annotated[ReachRange, Tag("[list]")]
+    | Annotated[tuple[Reach, Reach], _ORDERED, Tag("[list]")]
     | Annotated[str, AfterValidator(_read_share), Tag("[word]")],
-    Discriminator(value_kind),
+    among_kinds("[number]", "[list]", "[word]"),
 ]
 """A distance: metres, [least, most] to draw from, `fit`, or a share of the picture."""
 Behind = Annotated[
-    Annotated[Reach, Tag("[number]")] | Annotated[ReachRange, Tag("[list]")] | Annotated[Literal["fit"], Tag("[word]")],
-    Discriminator(value_kind),
+    Annotated[Reach, Tag("[number]")]
+    | Annotated[tuple[Reach, Reach], _ORDERED, Tag("[list]")]
+    | Annotated[Literal["fit"], Tag("[word]")],
+    among_kinds("[number]", "[list]", "[word]"),
 ]
-
-
-def _number_kind(value: object) -> str:
-    return "[list]" if isinstance(value, list | tuple) else "[number]"
-
-
 Focal = Annotated[
-    Annotated[FocalLength, Tag("[number]")]
-    | Annotated[tuple[FocalLength, FocalLength], AfterValidator(lambda ends: ordered(Range(*ends))), Tag("[list]")],
-    Discriminator(_number_kind),
+    Annotated[FocalLength, Tag("[number]")] | Annotated[tuple[FocalLength, FocalLength], _ORDERED, Tag("[list]")],
+    among_kinds("[number]", "[list]"),
 ]
 Principal = Annotated[
     Annotated[PrincipalPoint, Tag("[number]")]
-    | Annotated[
-        tuple[PrincipalPoint, PrincipalPoint], AfterValidator(lambda ends: ordered(Range(*ends))), Tag("[list]")
-    ],
-    Discriminator(_number_kind),
+    | Annotated[tuple[PrincipalPoint, PrincipalPoint], _ORDERED, Tag("[list]")],
+    among_kinds("[number]", "[list]"),
 ]
 """A number, or [least, most] to draw from for each input camera."""
 
@@ -237,7 +230,7 @@ def _named(name: str) -> str:
 Point = tuple[Offset, Offset, Offset]
 About = Annotated[
     Annotated[Literal["object", "table", "world"], Tag("[word]")] | Annotated[Point, Tag("[list]")],
-    Discriminator(lambda value: "[list]" if isinstance(value, list | tuple) else "[word]"),
+    among_kinds("[word]", "[list]"),
 ]
 Angle = Annotated[float, Field(ge=-360, le=360)]
 FieldOfView = Annotated[float, Field(ge=0.1, le=175)]

@@ -5,9 +5,9 @@ Targets are what networks are trained on beside the images of the article, by vi
 
 from typing import Annotated, Literal
 
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import Field, Tag, field_validator, model_validator
 
-from schemas.base import Frozen, Interval, NonNegative, Positive, PositiveInt, Range, Share
+from schemas.base import Frozen, Interval, NonNegative, Positive, PositiveInt, Range, Share, among_kinds
 
 
 class Patch(Frozen):
@@ -85,7 +85,7 @@ class Render(Frozen):
 
 Background = Annotated[
     Annotated[Literal["transparent"], Tag("[word]")] | Annotated[tuple[Share, Share, Share], Tag("[list]")],
-    Discriminator(lambda value: "[list]" if isinstance(value, list | tuple) else "[word]"),
+    among_kinds("[word]", "[list]"),
 ]
 
 

@@ -18,9 +18,9 @@ from schemas.errors import ViewError
 from schemas.job.cameras import SPHERE_SHARE, VIEW_PRESETS, Cameras, Mirror, More, Ring, Sphere, share_of
 from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, ScenePlan
-from schemas.scene.shape import Mesh
 from schemas.scene.view import VIEW_ROLES, Camera, Intrinsics, NamedCamera, Role
 from workers.assets.poses import PoseFile, read_poses
+from workers.assets.winding import winding_numbers
 from workers.geometry.camera import NEAR_M, look_at, orbit_pose, project, yaw
 from workers.geometry.frames import UP, half_turn, invert, pose, rotation_about, transform, translation
 from workers.geometry.zbuffer import count_covered
@@ -180,10 +180,8 @@ def place_more(
     """
     for entry in job.cameras.more:
         if entry.beside is None:
-            rng, k = (
-                chance.stream(Stream.MORE, crc32(entry.name.encode())),
-                intrinsics_of(entry, Intrinsics.of(job.cameras.sensor)),
-            )
+            rng = chance.stream(Stream.MORE, crc32(entry.name.encode()))
+            k = intrinsics_of(entry, Intrinsics.of(job.cameras.sensor))
             if entry.poses is None:
                 placed, first = _Placed.of(plan, poses), plan.input_cameras[0]
                 stands = ((T, k) for T in _stands(entry, rng, placed, k, first, job.images.depth_range_m))
@@ -361,24 +359,11 @@ def _require_room(name: str, number: int, position: Array, plan: ScenePlan, pose
     where = f"camera {name}, number {number}, at ({', '.join(f'{x:.3f}' for x in position)}) m"
     if plan.ground is not None and position[2] <= 0.0:
         raise ViewError("camera_in_scene", f"{where} is below the floor: raise its inclination, or its about")
-    things = [(each.asset.instance_id, each.asset.shape.mesh, T) for each, T in zip(plan.objects, poses, strict=True)]
+    things = [(each.asset.instance_id, each.asset.shape, T) for each, T in zip(plan.objects, poses, strict=True)]
     if plan.ground is not None:
-        things.append(("the table", plan.table.mesh, np.eye(4)))
-    for what, mesh, T in things:
-        if _is_inside(mesh, transform(invert(T), position[None, :])[0]):
+        things.append(("the table", plan.table.asset.shape, plan.table.T_world_table))
+    for what, shape, T in things:
+        point, (low, high) = transform(invert(T), position[None, :]), shape.bounds
+        # Few cameras are in a box, and to go round one point takes as long as to sort all faces.
+        if ((point > low) & (point < high)).all() and abs(winding_numbers(point, shape.mesh)[0]) > 0.5:
             raise ViewError("camera_in_scene", f"{where} is inside of {what}: take a larger radius_m, or fit")
-
-
-def _is_inside(mesh: Mesh, point: Array) -> bool:
-    """Whether a point [3] is inside of a closed mesh, in its frame: a ray from there meets an odd number of faces."""
-    if not ((point > mesh.vertices.min(axis=0)) & (point < mesh.vertices.max(axis=0))).all():
-        return False
-    a, b, c = (mesh.vertices[mesh.faces[:, n]] - point for n in range(3))
-    ray = np.array([0.1234567, 0.2345678, 1.0])  # along no edge that a shape of right angles has
-    sides = [
-        np.einsum("ij,ij->i", np.cross(u, v), ray[None, :].repeat(len(u), axis=0)) for u, v in ((a, b), (b, c), (c, a))
-    ]
-    met = (np.sign(sides[0]) == np.sign(sides[1])) & (np.sign(sides[1]) == np.sign(sides[2])) & (sides[0] != 0.0)
-    normals = np.cross(b - a, c - a)
-    ahead = np.einsum("ij,ij->i", a, normals) / np.where(met, normals @ ray, 1.0) > 0.0
-    return bool((met & ahead).sum() % 2)

@@ -75,6 +75,7 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
         "start: {pose: uprigth}",
         ["start.pose: 'uprigth': did you mean 'upright'? must be 'upright', 'tumbled', 'placed' or"],
     ),
+    ("assets: {density_kg_m3: {mug: -1}}", ["assets.density_kg_m3.mug: -1: must be greater than 0"]),
     ("cameras: {depth: {offset_m: [0, 0, x]}}", ["cameras.depth.offset_m.2: 'x'"]),
     *(
         (
