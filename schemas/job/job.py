@@ -19,6 +19,7 @@ from schemas.base import Frozen, NonNegativeInt, Positive, PositiveInt, Seed, Sh
 from schemas.job.assets import CATEGORIES, Assets, CategoryName, describe_unknown, offered_by, with_categories
 from schemas.job.cameras import Cameras
 from schemas.job.captures import Captures, with_capture_keys
+from schemas.job.look import Look
 from schemas.job.physics import ONE_OBJECT, ObjectCount, Physics, Start
 from schemas.job.views import Images, Render, SensorEffects, Studio, Targets
 
@@ -203,6 +204,8 @@ class Job(Frozen):
     """Encodings, patches and projection."""
     render: Render = Render()
     """How RGB is made."""
+    look: Look = Look()
+    """Light and surroundings."""
     sensor: SensorEffects = SensorEffects()
     """Effects of real sensors on exact images; none by default."""
     targets: Targets = Targets()
