@@ -240,7 +240,8 @@ def verify_independently(
         given = None
         if table is not None:
             rows = read_scene(table, scene_id)
-            given = [(each.instance_id, each.T_world_obj) for each in rows.objects], [T for T, _ in rows.cameras]
+            objects_there = [(each.instance_id, None if each.of_source else each.T_world_obj) for each in rows.objects]
+            given = objects_there, [T for T, _ in rows.cameras]
 
         def read(path: str, images: ReadFile = images) -> bytes:
             return store.read(path) if is_shape(path) else images(path)

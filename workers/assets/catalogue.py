@@ -127,22 +127,17 @@ class Catalogue:
 
     def find(self, name: str, tables: bool = False) -> InstanceRef | None:
         """The instance of an object, or of a table, by its id; None where no source has it."""
+        stem, _, index = name.rpartition("-")
         for number, (settings, library) in enumerate(self._sources(TABLE if tables else "")):
-            if isinstance(settings, ProceduralSource):
-                for category in (TABLE,) if tables else CATEGORIES:
-                    kind, _, index = name.rpartition("-")
-                    if kind == f"{settings.named(category)}-{settings.seed}" and index.isdecimal():
-                        ref = self.refer(number, category, int(index))
-                        if ref.instance_id == name and ref.index < settings.instances:
-                            return ref
+            if library is not None:  # whose names may end in a size
+                places = [library.places[each] for each in (name, stem) if each in library.places]
             else:
-                assert library is not None
-                places = library.places
-                for each in (name, name.rpartition("-")[0]):
-                    if each in places and (places[each][0] == TABLE) == tables:
-                        ref = self.refer(number, *places[each])
-                        if ref.instance_id == name:
-                            return ref
+                assert isinstance(settings, ProceduralSource)
+                known = index.isdecimal() and int(index) < settings.instances
+                places = [(category, int(index)) for category in ((TABLE,) if tables else CATEGORIES) if known]
+            for category, place in places:
+                if (category == TABLE) is tables and (ref := self.refer(number, category, place)).instance_id == name:
+                    return ref
         return None
 
     def libraries(self) -> "list[Library]":

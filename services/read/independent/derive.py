@@ -86,7 +86,7 @@ class StoredPair:
     """Findings of targets, of every view."""
     absent: list[str] = field(default_factory=list)
     """Why targets were not judged: shapes that are not stored."""
-    given: tuple[Sequence[tuple[str | None, Array]], Sequence[Array]] | None = None
+    given: tuple[Sequence[tuple[str | None, Array | None]], Sequence[Array]] | None = None
     """Instances and poses of objects, and poses of cameras, that the table of scenes has; None where it is not at hand."""
 
     @property

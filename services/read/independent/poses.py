@@ -67,8 +67,8 @@ def check_given(pair: StoredPair) -> Iterator[str]:
             body["instance_id"] for body in pair.bodies
         ]:
             yield "objects are not those of scenes_from"
-        for body, (_, T) in zip(pair.bodies, objects, strict=False):
-            wanted.append((f"T_world_obj of region {body['region_id']}", matrix(body, "T_world_obj"), T))
+        there = [(f"T_world_obj of region {body['region_id']}", matrix(body, "T_world_obj")) for body in pair.bodies]
+        wanted = [(*each, T) for each, (_, T) in zip(there, objects, strict=False) if T is not None]
     if pair.has_given_cameras:
         number = view["parent_id"] // 2 % pair.job["pairs_per_scene"]
         wanted.append(("T_world_cam of the input view", matrix(view, "T_world_cam"), cameras[number]))
