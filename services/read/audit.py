@@ -9,7 +9,6 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from scipy.stats import t as student_t
@@ -17,19 +16,19 @@ from scipy.stats import t as student_t
 from schemas.base import Pose
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import is_shape, stored_images, stored_roles, stored_shape
-from schemas.errors import CorruptError, InputError, SceneError, VersoError, command_line, plural
+from schemas.errors import CorruptError, InputError, SceneError, command_line, plural
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan, ObjectStart, Placed, PosedScene, SceneOutput
 from schemas.scene.shape import Shape
 from schemas.scene.view import MODALITIES, Camera, View
-from services.job.record import JobRecord, read_success, require_job
+from services.job.record import read_success, require_job
 from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, committed_reader, file_reader, find_scene
 from services.read.independent.derive import Kind, StoredPair
 from services.read.independent.poses import check_forces, check_merged, check_pair, list_underived
 from services.read.replay import compare_files, compare_rows, is_same_stack, open_context
+from services.read.scene_geometry import Sources
 from workers.assets.poses import PoseFile
 from workers.assets.scene_tables import read_scene
-from workers.capture.results import open_sources
 from workers.geometry.camera import NEAR_M, project
 from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import edge_distance_px
@@ -207,17 +206,6 @@ def stored_kinds(job: Job) -> dict[str, list[Kind]]:
     return kinds
 
 
-def find_table(record: JobRecord) -> PoseFile | None:
-    """The table of scenes of a stored job; None without one, and where it is not what it was when the job was run."""
-    if record.job.scenes_from is None:
-        return None
-    try:
-        catalogue = open_sources(record.job, Path(record.folder))
-    except (VersoError, OSError):
-        return None
-    return catalogue.scenes if catalogue.digest == record.catalogue else None
-
-
 def verify_independently(
     store: Store, count: int, progress: Callable[[IndependentVerdict], None]
 ) -> IndependentVerdict:
@@ -225,8 +213,8 @@ def verify_independently(
     record = require_job(store)
     job = record.job.model_dump(mode="json")
     verdict, kinds = IndependentVerdict(underived=list_underived(job)), stored_kinds(record.job)
-    table = find_table(record)
-    if record.job.scenes_from is not None and table is None:
+    table: PoseFile | None = None
+    if record.job.scenes_from is not None and (table := getattr(Sources(record).opened, "scenes", None)) is None:
         verdict.underived.append("poses are not compared with scenes_from: it is not here, or not what it was")
     views: list[Row] = []
     objects: list[Row] = []

@@ -51,7 +51,7 @@ class Sources:
             from workers.scene.chance import SceneChance
             from workers.scene.plan import choose_assets
             from workers.scene.studio import scaled_to
-        catalogue = self._opened
+        catalogue = self.opened
         if isinstance(catalogue, InputError):
             raise InputError(f"{missing} its source cannot be read here: {catalogue}") from catalogue
         if isinstance(catalogue, Exception):
@@ -68,7 +68,7 @@ class Sources:
         return scaled_to(asset, job.studio) if job.scene == "studio" else asset
 
     @cached_property
-    def _opened(self) -> "Catalogue | VersoError | OSError":
+    def opened(self) -> "Catalogue | VersoError | OSError":
         """The job's catalogue, or why it cannot be used: found once, because every file of the sources is read for it."""
         from workers.capture.results import open_sources
 

@@ -173,11 +173,8 @@ def _camera_of(row: Row) -> tuple[Pose, Intrinsics | None] | None:
     if all(value is None for value in values.values()):
         return T, None
     for name, (least, most, whole) in BOUNDS.items():
-        if (
-            not isinstance(value := values[name], int | float)
-            or not least <= value <= most
-            or value != (int(value) if whole else value)
-        ):
+        value = values[name]
+        if not isinstance(value, int | float) or not least <= value <= most or (whole and value % 1):
             raise ValueError(f"{name} is {value}, and must be from {least:g} to {most:g}{', whole' * whole}")
     return T, Intrinsics.model_validate(values)
 

@@ -290,7 +290,7 @@ SHARE = 0.01
 
 def check_forces(job: Mapping[str, Any], scene: Row) -> Iterator[str]:
     """What the forces of a scene's contacts do not explain, a sentence each."""
-    bodies = scene["bodies"] if KEPT not in scene["effects"] else None
+    bodies = scene["bodies"] if KEPT not in scene.get("effects", ()) else None
     falls = job.get("captures") is None and job.get("scene") != "studio"
     if not bodies or not falls or not job["physics"]["exact_rest"]:
         return
