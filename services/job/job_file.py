@@ -151,7 +151,7 @@ def folders_of(job: Job) -> dict[str, str]:
         for number, source in enumerate(getattr(job.assets, branch))
     }
     folders = job.captures.folders if job.captures is not None else []
-    return sources | {f"captures.folders.{number}": folder for number, folder in enumerate(folders)}
+    return sources | job.look.folders | {f"captures.folders.{number}": name for number, name in enumerate(folders)}
 
 
 def refuse_folders(job: Job, name: str, fits: Callable[[str], bool], why: str) -> None:

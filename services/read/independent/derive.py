@@ -38,7 +38,7 @@ MOST_BROKEN_TIES = 0.25
 FLOOR_M = 1e4
 """Half the side of a floor, or of a capture's board, which are in no file: planes, whose colour is not judged."""
 
-FLOOR, TABLE, FIRST_OBJECT = 1, 2, 3
+FLOOR, TABLE, FIRST_OBJECT, FIRST_CLUTTER = 1, 2, 3, 200
 
 
 def name_of(row: Row) -> str:
@@ -125,6 +125,11 @@ class StoredPair:
         return self.scene["bodies"] or [{**self.scene, "region_id": FIRST_OBJECT}]
 
     @property
+    def clutter(self) -> list[int]:
+        """Regions of objects that have no rows of their own."""
+        return [body["region_id"] for body in (self.scene["surroundings"] or {}).get("clutter", ())]
+
+    @property
     def regions(self) -> list[int]:
         """Region ids of the objects."""
         return [body["region_id"] for body in self.bodies]
@@ -183,6 +188,11 @@ def _plane() -> Faces:
     corners = FLOOR_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     points = corners[[[0, 1, 2], [0, 2, 3]]]
     return replace(bare_faces(points), normals=np.broadcast_to([0.0, 0.0, 1.0], points.shape))
+
+
+def of_objects(region: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Whether region ids are of objects with rows."""
+    return (region >= FIRST_OBJECT) & (region < FIRST_CLUTTER)
 
 
 def own_region(kind: str) -> int | None:
@@ -252,7 +262,7 @@ def check_labels(pair: StoredPair, view: Row) -> Iterator[str]:
     poses = {body["region_id"]: matrix(body, "T_world_obj") for body in pair.bodies}
     if not pair.is_studio:
         poses[TABLE] = matrix(pair.scene, "T_world_table")
-    if labels.keys() != poses.keys() or not set(np.unique(region).tolist()) <= {0, FLOOR, *poses}:
+    if labels.keys() != poses.keys() or not set(np.unique(region).tolist()) <= {0, FLOOR, *poses, *pair.clutter}:
         yield f"regions are {sorted(labels)} in objects, {sorted(poses)} in scenes, {np.unique(region)} in the mask"
         return
     rgb = pair.images.get((name_of(view), "rgb"), region)
@@ -262,7 +272,7 @@ def check_labels(pair: StoredPair, view: Row) -> Iterator[str]:
         and ((rgb[..., 3] == 0) & (region > 0) | (rgb[..., 3] == 255) & (region == 0)).any()
     ):
         yield "alpha is 0 where the mask shows something, or 255 where it does not"
-    if view["object_pixels"] != np.count_nonzero(region >= FIRST_OBJECT):
+    if view["object_pixels"] != np.count_nonzero(of_objects(region)):
         yield f"object_pixels {view['object_pixels']} is not the number of pixels of objects"
     for number, label in labels.items():
         T = np.linalg.inv(matrix(view, "T_world_cam")) @ poses[number]

@@ -23,6 +23,7 @@ from services.read.independent.derive import (
     faces_of,
     matrix,
     name_of,
+    of_objects,
 )
 from services.read.independent.rays import (
     BEHIND_M,
@@ -181,6 +182,8 @@ def _judge_seen(kind: Kind, pair: StoredPair, view: Row, faces: Faces, own: Hits
     shown = region >= least
     if kind.formula == "albedo" and np.isnan(faces.colors[faces.region == FLOOR]).any():
         shown &= region != FLOOR
+    if least == FIRST_OBJECT:
+        shown = of_objects(region)
     judged = shown | (region < least)
     off = np.where(stored.any(axis=1), np.inf, 0.0)
     if not pair.is_captured:
@@ -300,7 +303,7 @@ def _judge_covisible(pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Fi
     As many at edges of the mask as of objects elsewhere, evenly by number; not those near an edge in this view, see `seen_by`.
     """
     mask, first, around = pair.images[name_of(view), "covisible"], pair.views["input"], np.ones((3, 3), np.uint8)
-    shown = pair.images[name_of(view), "region"] >= FIRST_OBJECT
+    shown = of_objects(pair.images[name_of(view), "region"])
     beside = shown & (cv2.dilate(mask * shown, around) != cv2.erode(np.where(shown, mask, 255), around))
     chosen = [np.flatnonzero(some) for some in (beside, shown & ~beside)]
     pixels = np.sort(np.concatenate([some[:: len(some) // COVISIBLE_PIXELS + 1] for some in chosen]))
