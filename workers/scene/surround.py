@@ -6,8 +6,9 @@ from dataclasses import replace
 from schemas.job.job import Job
 from schemas.job.look import Look, Surface
 from schemas.scene.scene import ScenePlan
+from schemas.scene.shape import Shape
 from workers.assets.catalogue import Catalogue
-from workers.assets.pictures import Pictures, load_picture
+from workers.assets.pictures import load_picture
 from workers.assets.surroundings import Coat, build_room, cover_floor, cover_table, draw_coat, require_table_inside
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.effects import BRANCHES
@@ -33,13 +34,16 @@ def surround(job: Job, look: Look, catalogue: Catalogue, chance: SceneChance, pl
     """
     drawn: dict[str, object] = {}
     if plan.ground is not None:
-        ground, floor = plan.ground, cover_of("floor", look.floor, catalogue.pictures, chance)
-        if floor is not None:
-            drawn |= _named("floor", floor)
-            ground = replace(ground, floor=cover_floor(ground.floor, floor))
-        if (table := cover_of("table", look.table, catalogue.pictures, chance)) is not None:
-            drawn |= _named("table", table)
-            ground = replace(ground, cover=cover_table(ground.table.asset, table))
+        ground = plan.ground
+        if look.floor is not None:
+            floor, coat = lay_floor(look.floor, catalogue, chance, ground.floor)
+            drawn |= _named("floor", coat)
+            ground = replace(ground, floor=floor)
+        if look.table is not None:
+            rng, pictures = chance.stream(Stream.SURROUNDINGS, TABLE), catalogue.pictures.get("look.table.folder", ())
+            coat = draw_coat(look.table, pictures, rng, SMOOTH)
+            drawn |= _named("table", coat)
+            ground = replace(ground, cover=cover_table(ground.table.asset, coat))
         if look.room is not None:
             towards = plan.appearance.lights[0].direction
             walls = build_room(look.room, towards, chance.stream(Stream.SURROUNDINGS, ROOM))
@@ -57,13 +61,11 @@ def surround(job: Job, look: Look, catalogue: Catalogue, chance: SceneChance, pl
     return replace(plan, surroundings=drawn) if drawn or look.clutter is not None else plan
 
 
-def cover_of(key: str, surface: Surface | None, pictures: Pictures, chance: SceneChance) -> Coat | None:
-    """What the floor or the table of a scene is covered with; None where the job leaves it as it is."""
-    if surface is None:
-        return None
-    part, roughness = {"floor": (FLOOR, ROUGH), "table": (TABLE, SMOOTH)}[key]
-    rng = chance.stream(Stream.SURROUNDINGS, part)
-    return draw_coat(surface, pictures.get(f"look.{key}.folder", ()), rng, roughness)
+def lay_floor(surface: Surface, catalogue: Catalogue, chance: SceneChance, floor: Shape) -> tuple[Shape, Coat]:
+    """The floor as a scene has it, and what it is covered with."""
+    rng = chance.stream(Stream.SURROUNDINGS, FLOOR)
+    coat = draw_coat(surface, catalogue.pictures.get("look.floor.folder", ()), rng, ROUGH)
+    return cover_floor(floor, coat), coat
 
 
 def _named(key: str, coat: Coat) -> Mapping[str, object]:

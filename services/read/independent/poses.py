@@ -121,7 +121,7 @@ def _subject(pair: StoredPair) -> Subject:
     """What named cameras are placed about. Raises FileNotFoundError without a shape's file."""
     world = {region: (shape.points.reshape(-1, 3), T) for region, shape, T in things_of(pair)}
     at = {region: points @ T[:3, :3].T + T[:3, 3] for region, (points, T) in world.items()}
-    objects = [region for region in world if region >= FIRST_OBJECT]
+    objects = [region for region in world if FIRST_OBJECT <= region < FIRST_CLUTTER]
     top_m = float(at[TABLE][:, 2].max()) if TABLE in at else 0.0
     nearest_m = pair.job["images"]["depth_range_m"][0]
     return Subject(np.concatenate([at[region] for region in objects]), top_m, nearest_m)
@@ -180,8 +180,16 @@ def list_underived(job: Mapping[str, Any]) -> list[str]:
         lines.append(f"poses of {', '.join(tables)} are not derived: a table of poses has them")
     if sensor["depth_noise"]:
         lines.append("depth is not compared with the floor's plane: sensor.depth_noise is on")
+    look = job.get("look", {})
+    if look.get("room"):
+        lines.append("walls are compared with the size of their room alone: their shape is in no file")
     if views := job.get("targets", {}).get("views"):
         lines += ["albedo of the floor is not derived: its look is in no file"] if "albedo" in views else []
+        lines += (
+            ["albedo of tables is not derived: look.table covers them"]
+            if "albedo" in views and look.get("table")
+            else []
+        )
         lines += ["covisible is derived at some of its pixels: 2,000 of a view at most"] if "covisible" in views else []
     return lines
 
