@@ -159,8 +159,8 @@ surroundings.floor_tile_m | double? | m | - | Width of that picture on the floor
 surroundings.table | string? | - | - | Picture of the table, below its folder, or sRGB colour.
 surroundings.table_tile_m | double? | m | - | Width of that picture on the table.
 surroundings.background | string? | - | - | Picture behind everything, below its folder.
-surroundings.room_m | double[3]? | m | world | Length along x, width along y, and height of the room inside.
-surroundings.clutter | list of struct | - | - | Objects that have no other row, in images, masks and depth alone.
+surroundings.room_m | list of double? | m | world | Length along x, width along y, and height of the room inside.
+surroundings.clutter | list of struct? | - | - | Objects that have no other row, in images, masks and depth alone.
 surroundings.clutter[].region_id | int64 | id | - | {region}
 surroundings.clutter[].category | string | - | - | {category}
 surroundings.clutter[].instance_id | string | - | - | {instance}
