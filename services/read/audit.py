@@ -16,7 +16,7 @@ from scipy.stats import t as student_t
 from schemas.base import Pose
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import is_shape, stored_images, stored_roles, stored_shape
-from schemas.errors import CorruptError, InputError, SceneError, command_line, plural
+from schemas.errors import CorruptError, InputError, SceneError, VersoError, command_line, plural
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan, ObjectStart, Placed, PosedScene, SceneOutput
 from schemas.scene.shape import Shape
@@ -214,8 +214,11 @@ def verify_independently(
     job = record.job.model_dump(mode="json")
     verdict, kinds = IndependentVerdict(underived=list_underived(job)), stored_kinds(record.job)
     table: PoseFile | None = None
-    if record.job.scenes_from is not None and (table := getattr(Sources(record).opened, "scenes", None)) is None:
-        verdict.underived.append("poses are not compared with scenes_from: it is not here, or not what it was")
+    if record.job.scenes_from is not None:
+        try:
+            table = Sources(record).catalogue.scenes
+        except (VersoError, OSError):
+            verdict.underived.append("poses are not compared with scenes_from: it is not here, or not what it was")
     views: list[Row] = []
     objects: list[Row] = []
     for scene_id in choose_scenes(store, count, record.job.seed):
