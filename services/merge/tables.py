@@ -282,6 +282,7 @@ def write_card(store: Store, record: JobRecord, catalogue: "Catalogue", merged: 
 def describe_dataset(record: JobRecord, catalogue: "Catalogue", merged: MergeResult, fingerprint: Fingerprint) -> str:
     """The text of DATASET.md."""
     job, objects = record.job, record.job.objects_per_scene
+    objects_in_each = f"{objects.low}{f' to {objects.high}' * (objects.low < objects.high)}"
     libraries = "\n".join(f"| {name} | {version} |" for name, version in sorted(fingerprint.libraries.items()))
     alone = job.scene == "studio"
     sources = "\n".join(f"- {x}" for x in describe_sources(catalogue) if not (alone and x.startswith("tables")))
@@ -297,7 +298,7 @@ def describe_dataset(record: JobRecord, catalogue: "Catalogue", merged: MergeRes
 |---|---|
 | scenes | {job.first_scene} to {job.stop_scene - 1}: {counts} |
 | pairs in each scene | {"at most " * captured}{job.pairs_per_scene} |
-| objects in each scene | {objects.low}{f" to {objects.high}" * (objects.low < objects.high)} |
+| objects in each scene | {"as scenes_from has them" if job.scenes_from else objects_in_each} |
 | views of each pair | {", ".join(stored_roles(job))}{"" if job.render.rgb else "; without RGB"} |
 {more}| seed | {job.seed} |
 | dataset digest | `{merged.digest}` |

@@ -84,7 +84,7 @@ class _Kind(NamedTuple):
 
     files: Callable[[Path], list[Path]]
     scene_ids: Callable[[Path], Array | None]
-    rows: Callable[[Path, int], list[Row]]
+    rows: Callable[[PoseFile, int], list[Row]]
 
 
 def open_scenes(job: Job, folder: Path) -> PoseFile | None:
@@ -110,7 +110,7 @@ def read_scene(file: PoseFile, scene_id: int) -> GivenScene:
     where = f"scene {scene_id} in {file.path}"
     try:
         with naming(f"scenes_from: {file.path}"):
-            rows = _kind_of(file.path).rows(file.path, scene_id)
+            rows = _kind_of(file.path).rows(file, scene_id)
     except AssetSourceError as error:
         raise StartError("bad_row", str(error)) from error
     objects, cameras, seen = dict[Any, GivenObject](), dict[Any, tuple[Pose, Intrinsics | None]](), dict[Any, int]()
@@ -144,7 +144,7 @@ def _kind_of(path: Path) -> _Kind:
     if (path / MANIFEST).is_dir():
         return _DATASET
     if find_bop_scenes(path):
-        return _Kind(bop_files, bop_ids, bop_rows)
+        return _Kind(bop_files, bop_ids, lambda file, scene_id: bop_rows(file.path, scene_id))
     raise ValueError(f"holds no {MANIFEST} of a finished dataset, and no {GT} of a scene in the BOP layout")
 
 
@@ -199,6 +199,8 @@ def _scene_ids(path: Path, table: str = "") -> Array:
     """The column `scene_id` [N] int64. Raises ValueError where one is no whole number."""
     parts = [np.zeros(0, np.int64)]
     for batch in chain.from_iterable(_readers(path, table, ("scene_id",))):
+        if not pa.types.is_integer(kind := batch.schema.field("scene_id").type) and not pa.types.is_floating(kind):
+            raise ValueError(f"scene_id is {kind}, and must be whole numbers")
         try:
             parts.append(batch.column("scene_id").cast(pa.int64()).to_numpy())
         except pa.ArrowException as error:
@@ -207,10 +209,10 @@ def _scene_ids(path: Path, table: str = "") -> Array:
 
 
 @lru_cache(maxsize=8)
-def _rows_near(path: Path, table: str, columns: tuple[str, ...], first: int) -> list[Row]:
+def _rows_near(file: PoseFile, table: str, columns: tuple[str, ...], first: int) -> list[Row]:
     """The rows of `TOGETHER` scenes from `first` on; all where there are no ids."""
     near, rows = range(first, first + TOGETHER), list[Row]()
-    for reader in _readers(path, table, ("scene_id", *columns), near):
+    for reader in _readers(file.path, table, ("scene_id", *columns), near):
         there = [name for name in ("scene_id", *columns) if name in reader.schema.names]
         for batch in reader:
             if "scene_id" in there:
@@ -220,8 +222,8 @@ def _rows_near(path: Path, table: str, columns: tuple[str, ...], first: int) -> 
     return rows
 
 
-def _rows(path: Path, table: str, columns: tuple[str, ...], scene_id: int) -> list[Row]:
-    near = _rows_near(path, table, columns, scene_id // TOGETHER * TOGETHER)
+def _rows(file: PoseFile, table: str, columns: tuple[str, ...], scene_id: int) -> list[Row]:
+    near = _rows_near(file, table, columns, scene_id // TOGETHER * TOGETHER)
     return [row for row in near if row.get("scene_id", scene_id) == scene_id]
 
 
@@ -236,7 +238,7 @@ def _table_ids(path: Path) -> Array | None:
     return _scene_ids(path) if "scene_id" in names else None
 
 
-_TABLE = _Kind(lambda path: [path], _table_ids, lambda path, scene_id: _rows(path, "", _COLUMNS, scene_id))
+_TABLE = _Kind(lambda path: [path], _table_ids, lambda file, scene_id: _rows(file, "", _COLUMNS, scene_id))
 
 
 def _dataset_ids(path: Path) -> Array:
@@ -249,15 +251,17 @@ def _dataset_ids(path: Path) -> Array:
     return np.concatenate([_scene_ids(path, name) for name in ("scenes", "failures")])
 
 
-def _dataset_rows(path: Path, scene_id: int) -> list[Row]:
+def _dataset_rows(file: PoseFile, scene_id: int) -> list[Row]:
     """Objects, and then the input cameras in order of their pairs."""
-    for failure in _rows(path, "failures", ("reason", "detail"), scene_id):
-        raise StartError("failed_before", f"it failed in {path} ({failure['reason']}): {failure['detail']}")
-    scenes = _rows(path, "scenes", ("table_id", "bodies"), scene_id)
+    for failure in _rows(file, "failures", ("reason", "detail"), scene_id):
+        raise StartError("failed_before", f"it failed in {file.path} ({failure['reason']}): {failure['detail']}")
+    scenes = _rows(file, "scenes", ("table_id", "bodies"), scene_id)
     if any(scene["table_id"] is None or not scene["bodies"] for scene in scenes):
-        raise StartError("no_table", f"{path} has captures, or scenes of a studio: take a dataset of scenes on a table")
-    shapes = _shapes_near(path, scene_id // TOGETHER * TOGETHER)
-    views = _rows(path, "views", ("role", "pose_id", *_CAMERA), scene_id)
+        raise StartError(
+            "no_table", f"{file.path} has captures, or scenes of a studio: take a dataset of scenes on a table"
+        )
+    shapes = _shapes_near(file, scene_id // TOGETHER * TOGETHER)
+    views = _rows(file, "views", ("role", "pose_id", *_CAMERA), scene_id)
     inputs = sorted((view for view in views if view["role"] == "input"), key=lambda view: view["pose_id"])
     return [
         {**body, "table_id": scene["table_id"], "sha256": shapes[body["instance_id"]]}
@@ -267,11 +271,11 @@ def _dataset_rows(path: Path, scene_id: int) -> list[Row]:
 
 
 @lru_cache(maxsize=4)
-def _shapes_near(path: Path, first: int) -> dict[str, str]:
+def _shapes_near(file: PoseFile, first: int) -> dict[str, str]:
     """The digests of the shapes that `TOGETHER` scenes have, by instance."""
-    near = _rows_near(path, "scenes", ("table_id", "bodies"), first)
+    near = _rows_near(file, "scenes", ("table_id", "bodies"), first)
     names, shapes = pa.array({body["instance_id"] for scene in near for body in scene["bodies"]}), dict[str, str]()
-    for batch in chain.from_iterable(_readers(path, "assets", ("instance_id", "sha256"))):
+    for batch in chain.from_iterable(_readers(file.path, "assets", ("instance_id", "sha256"))):
         chosen = batch.filter(pc.is_in(batch.column("instance_id"), names))
         shapes |= {row["instance_id"]: row["sha256"] for row in chosen.to_pylist()}
     return shapes

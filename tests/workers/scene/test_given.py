@@ -375,7 +375,7 @@ BAD: dict[str, tuple[Any, str]] = {
         "scene_id,x\n0,1\n",
         "has no column instance_id or category; no T_world_obj, nor T00 to T33; its columns are",
     ),
-    "ids.csv": ("scene_id,category,T_world_obj\nx,box,1\n", "scene_id is no whole number after row 0"),
+    "ids.csv": ("scene_id,category,T_world_obj\nx,box,1\n", "scene_id is string, and must be whole numbers"),
     "half.json": ([{**row(0, np.eye(4)), "scene_id": 0.5}], "scene_id is no whole number after row 0"),
     "scenes.txt": ("1", "its name ends in .txt: .csv, .parquet and .json are read"),
     "absent.csv": (None, "absent.csv cannot be read: No such file"),
