@@ -44,7 +44,7 @@ FRAMES = {
     "source": "the frame of the file that the shape came from",
 }
 
-Of = Literal["both", "scenes", "rest", "captures", "targets", "more"]
+Of = Literal["both", "scenes", "rest", "captures", "targets", "more", "look"]
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class Column:
     null: bool = False
     """Whether the value may be missing where the column applies."""
     of: Of = "both"
-    """The kind of dataset that has it, null in others: `rest`, of scenes on a table; `more`, of jobs with `cameras.more`. A table
-    without any value of a column has the digest of one without the column."""
+    """The kind of dataset that has it, null in others: `rest`, of scenes on a table; `more` and `look`, of jobs with
+    `cameras.more` or `look`. A table without any value of a column has the digest of one without the column."""
 
     @property
     def nullable(self) -> bool:
@@ -131,6 +131,15 @@ equilibrium_residual | double, rest | 1 | - | {balance}
 settle_s | double, rest | s | - | Simulated time until rest; the longest of all objects.
 raycast_checked | bool | - | - | Whether every view was checked against the ray caster.
 settings_digest | string | - | - | SHA-256 of the settings and sources that shape a scene.
+lights | list of struct, look | - | - | The lights of `look.lights`; the first casts shadows.
+lights[].towards | double[3] | 1 | world | Unit vector towards it.
+lights[].color | double[3] | 1 | - | Radiance of a white surface that faces it, linear RGB.
+lights[].temperature_k | double | K | - | Its colour temperature.
+lights[].size_deg | double | deg | - | Angle across it.
+environment | struct, look | - | - | The map of `look.environment`.
+environment.name | string | - | - | Name of its file, or of a built-in sky or room.
+environment.sha256 | string? | - | - | SHA-256 of the file; null of a built-in one.
+environment.turn_deg | double | deg | - | Its turn about the vertical, counter-clockwise from above.
 bodies | list of struct, scenes | - | - | Every object; above stand names and pose of the first, the worst figures of all.
 bodies[].region_id | int64 | id | - | {region}
 bodies[].category | string | - | - | {category}

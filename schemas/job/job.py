@@ -337,6 +337,8 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
         return f"scene is {job.scene}: leave it out, a capture's object lies on its board"
     if job.cameras.more:
         return "cameras.more names cameras: leave it out, a capture has the views that were taken"
+    if job.look != Look():
+        return "look has keys: leave them out, a capture has the light and surroundings of its photographs"
     if job.cameras.depth.enabled:
         return "cameras.depth.enabled is true: leave it out, depth of a capture is registered to its colour camera"
     if job.objects_per_scene != ONE_OBJECT:
@@ -351,7 +353,15 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
     return None if job.render.rgb else "render.rgb is false: a capture has colour, leave it out"
 
 
-PATHS = frozenset({"assets.objects.folder", "assets.tables.folder", "captures.folders", "cameras.more.poses"})
+PATHS = frozenset(
+    {
+        "assets.objects.folder",
+        "assets.tables.folder",
+        "captures.folders",
+        "cameras.more.poses",
+        "look.environment.folder",
+    }
+)
 """Keys that name places, where the same files may lie elsewhere."""
 
 NOT_OF_A_DATASET = PATHS | {"scenes", "run", "preset"}

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from schemas.base import Array, Pose
-from schemas.scene.shape import Appearance, Asset, Hull, Mesh, Shape
+from schemas.scene.shape import Appearance, Asset, Hull, Light, MapSource, Mesh, Shape
 from schemas.scene.view import Camera, NamedCamera
 
 EffectKind = Literal["asked", "no_op", "approximation"]
@@ -88,6 +88,28 @@ class ObjectStart:
 
 
 @dataclass(frozen=True, eq=False)
+class DrawnLights:
+    """Lights of `look.lights` and what goes with them: `ambient` from above and `below` from below, linear RGB.
+
+    temperatures_k: colour temperature of each light; rest: the share of all light that is not theirs, times the total.
+    """
+
+    lights: tuple[Light, ...]
+    temperatures_k: tuple[float, ...]
+    rest: float
+    ambient: tuple[float, float, float]
+    below: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnEnvironment:
+    """The map of `look.environment` and its turn, counter-clockwise from above."""
+
+    source: MapSource
+    turn_rad: float
+
+
+@dataclass(frozen=True, eq=False)
 class ScenePlan:
     """The plan of one scene."""
 
@@ -101,6 +123,10 @@ class ScenePlan:
     appearance: Appearance
     more: tuple[NamedCamera, ...] = ()
     """Further cameras that stand by themselves; known where the objects rest."""
+    lights: DrawnLights | None = None
+    """In the place of the lights of `appearance`."""
+    environment: DrawnEnvironment | None = None
+    """In the place of all light from around."""
 
     @property
     def table(self) -> Table:

@@ -31,7 +31,7 @@ from workers.render.tiers import require_tier
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.context import WorkerContext
 from workers.scene.effects import Facts, plan_effects
-from workers.scene.make_scene import Scene
+from workers.scene.make_scene import Scene, light_scene
 
 Box = tuple[float, float, float, float]
 """(left, top, right, bottom)."""
@@ -249,7 +249,7 @@ def converged_colour(context: WorkerContext, scene: Scene, crop: Crop, paths: in
     effects = plan_effects(Facts(context.job.model_copy(update={"render": render}), plan, False))
     camera = crop_camera(scene.pairs[0].input.camera, crop)
     rng = np.random.default_rng([TRUTH_SEED, scene.plan.scene_id])
-    drawn = draw_view(context.renderer, things, appearance, camera, render, lambda: rng, effects)
+    drawn = draw_view(context.renderer, things, light_scene(plan, effects), camera, render, lambda: rng, effects)
     assert drawn.rgb is not None
     return drawn.rgb
 

@@ -50,6 +50,10 @@ STUDIO: dict[str, Any] = {"scene": "studio"}
 FRAMED: dict[str, Any] = {"cameras": {"orbit": {"radius_m": 1.0}}}
 AROUND: dict[str, Any] = {"cameras": {"more": [{"name": "around", "ring": {"count": 3}}]}}
 
+LOOKS: dict[str, Any] = {name: {"look": {name: branch}} for name, branch in (
+    ("lights", {}), ("environment", {"built_in": ["softboxes"]}),
+)}  # fmt: skip
+
 ASKED: dict[str, Case] = {
     "depth_camera": _asked({}, {"cameras": {"depth": {"enabled": False}}}, "cameras.depth.enabled is false"),
     "mirror": _asked({}, WITHOUT_MIRROR, "cameras.mirror.enabled is false"),
@@ -74,6 +78,7 @@ ASKED: dict[str, Case] = {
     "release_again": _asked({"check": {"raycast_share": 1.0}}, {}, "not in the share check.raycast_share"),
     **{name: _target(name) for name in TARGETS},
     "further_views": _asked({**STUDIO, **merged(FRAMED, AROUND)}, {**STUDIO, **FRAMED}, "cameras.more is empty"),
+    **{name: _asked(look, {**look, **FLAT}, "render.tier is flat") for name, look in LOOKS.items()},
     "alpha": _asked(
         {**STUDIO, **FRAMED},
         {**STUDIO, **FRAMED, "studio": {"background": [0.0, 0.0, 0.0]}},
@@ -81,7 +86,7 @@ ASKED: dict[str, Case] = {
     ),
 }
 
-OF_OTHERS = {*TARGETS, "further_views", "alpha"}
+OF_OTHERS = {*TARGETS, *LOOKS, "further_views", "alpha"}
 """Effects that the receipt of a job does not name which has nothing of their kind."""
 
 NO_OPS: dict[str, Case] = {

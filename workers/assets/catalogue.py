@@ -28,7 +28,7 @@ from schemas.job.assets import (
     instance_id,
 )
 from schemas.job.job import differing_keys
-from schemas.scene.shape import Asset
+from schemas.scene.shape import Asset, MapSource
 from workers.assets.poses import PoseFile
 from workers.geometry.frames import add_up
 
@@ -75,6 +75,8 @@ class Catalogue:
     """Folders of captures, in order; the digest covers their files too."""
     poses: Mapping[str, PoseFile] = field(default_factory=dict)
     """Tables of camera poses by the name of their camera; the digest covers them too."""
+    maps: tuple[MapSource, ...] = ()
+    """Maps of light of the folder that `look.environment` names; the digest covers them too."""
 
     def offers(self, category: str) -> list[tuple[int, AnySource, int]]:
         """Number, settings and count of instances of every source that has this category."""

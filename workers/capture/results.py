@@ -24,6 +24,7 @@ from schemas.capture import CaptureListing, Reconstruction
 from schemas.errors import AssetSourceError, CaptureError, InputError, command_line
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
+from workers.assets.environment import open_maps
 from workers.assets.poses import open_poses
 from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW
 from workers.capture.truth import TRUTH
@@ -160,7 +161,7 @@ def _list_inputs(path: Path) -> list[Path]:
 
 
 def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue:
-    """The job's catalogue; with folders of captures its digest covers every input file of theirs.
+    """The job's catalogue; its digest covers every file that the job names.
 
     `watch` is told now and then how far it is. Raises AssetSourceError that names the key of a folder that cannot be used.
     """
@@ -168,6 +169,9 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
     if poses := open_poses(job, job_folder):
         whole = "\n".join([catalogue.digest, *(file.sha256 for file in poses.values())])
         catalogue = replace(catalogue, poses=poses, digest=hashlib.sha256(whole.encode()).hexdigest())
+    if job.look.environment is not None and (maps := open_maps(job.look.environment.folder, job_folder)):
+        whole = "\n".join([catalogue.digest, *(f"{source.name} {source.sha256}" for source in maps)])
+        catalogue = replace(catalogue, maps=maps, digest=hashlib.sha256(whole.encode()).hexdigest())
     if job.captures is None or not job.captures.folders:
         return catalogue
     listings, folders = [], job.captures.folders

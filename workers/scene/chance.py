@@ -31,6 +31,8 @@ class Stream(IntEnum):
     ORBIT = 18
     MORE = 19
     MIRROR = 20
+    LIGHTS = 21
+    ENVIRONMENT = 22
 
 
 _SENSORS = {"depth_noise": Stream.SENSOR_DEPTH, "rgb_noise": Stream.SENSOR_RGB, "exposure": Stream.SENSOR_EXPOSURE}

@@ -71,6 +71,7 @@ def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPl
     unasked = set(get_args(ViewTarget)) if not facts.job.targets.views else set()
     unasked |= {"further_views"} if not facts.job.cameras.more and not _is_studio(facts) else set()
     unasked |= {"alpha"} if not _is_studio(facts) else set()
+    unasked |= {name for name in type(facts.job.look).model_fields if not getattr(facts.job.look, name)}
     return _plan({name: why for name, why in reasons.items() if name not in unasked}, forced)
 
 
@@ -153,6 +154,13 @@ def _tier(*tiers: Tier) -> Reason:
         return None if facts.job.render.tier in tiers else f"render.tier is {facts.job.render.tier}"
 
     return _first_of(_stored("rgb"), skipped_because)
+
+
+def _look(name: str) -> Reason:
+    """An effect of colour that a key of `look` asks for."""
+    return _first_of(
+        _tier("raster", "pathtraced"), _where(lambda facts: getattr(facts.job.look, name), f"look.{name} is off")
+    )
 
 
 _NOT_TRACED = _where(lambda facts: facts.job.render.tier != "pathtraced", "part of global_illumination")
@@ -295,6 +303,7 @@ TABLE: tuple[Effect, ...] = (
     Effect("release_again", "asked", _on_ground("nothing rests", _RAYCAST), "recheck"),
     Effect("further_views", "asked", _where(lambda facts: facts.job.cameras.more, "cameras.more is empty"), "render"),
     Effect("alpha", "asked", _ALPHA, "targets"),
+    *(Effect(name, "asked", _look(name), "render") for name in ("lights", "environment")),
     Effect("floor", "no_op", _on_ground("there is no floor", _floor), "render", _always),
     Effect("table", "no_op", _on_ground("there is no table", _table), "render", _always),
     Effect("textures", "no_op", _first_of(_stored("rgb"), _TEXTURES), "render", _always),

@@ -8,8 +8,9 @@ import numpy as np
 
 from schemas.base import frozen_array
 from schemas.scene.scene import EffectPlan, Placed, PosedScene, ScenePlan, Settled
-from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
+from schemas.scene.shape import REGION_FLOOR, REGION_TABLE, Appearance
 from schemas.scene.view import Pair, View
+from workers.assets.environment import relight
 from workers.physics.settle import Rest, recheck_scene, settle_scene
 from workers.scene.cameras import frame_cameras, place_more
 from workers.scene.chance import SceneChance
@@ -106,7 +107,7 @@ def render_scene(context: WorkerContext, laid: Laid, stopwatch: Stopwatch) -> Sc
     """Render, derive, check: all after physics. Raises SceneError."""
     job, chance = context.job, SceneChance(context.job.seed, laid.plan.scene_id)
     plan, effects, rest = laid.plan, laid.effects, laid.rest
-    posed = pose_scene(plan, rest.settled)
+    posed = pose_scene(plan, rest.settled, effects)
     scene = SettledScene(context, chance, plan, posed, effects, stopwatch)
     with stopwatch.stage("render", "light_maps" if effects.runs("light_maps") else None):
         context.renderer.prepare_light(posed.things, posed.appearance, job.render, effects)
@@ -117,8 +118,15 @@ def render_scene(context: WorkerContext, laid: Laid, stopwatch: Stopwatch) -> Sc
     return Scene(plan, rest.settled, posed, pairs, effects, rest.called, partial(make_further, scene))
 
 
-def pose_scene(plan: ScenePlan, settled: Sequence[Settled]) -> PosedScene:
-    """Floor, table and objects where they rest, in order of region id."""
+def light_scene(plan: ScenePlan, effects: EffectPlan) -> Appearance:
+    """Light and background as the plan and its effects have them. Raises MeshError where a map of light is gone."""
+    lights = plan.lights if effects.runs("lights") else None
+    environment = plan.environment if effects.runs("environment") else None
+    return relight(plan.appearance, lights, environment, plan.ground is not None)
+
+
+def pose_scene(plan: ScenePlan, settled: Sequence[Settled], effects: EffectPlan) -> PosedScene:
+    """Floor, table and objects where they rest, in order of region id, and their light."""
     objects = tuple(
         Placed(start.region_id, start.asset.shape, rest.T_world_obj)
         for start, rest in zip(plan.objects, settled, strict=True)
@@ -127,4 +135,4 @@ def pose_scene(plan: ScenePlan, settled: Sequence[Settled]) -> PosedScene:
     if plan.ground is not None:
         table = Placed(REGION_TABLE, plan.table.asset.shape, plan.table.T_world_table)
         things = (Placed(REGION_FLOOR, plan.floor, frozen_array(np.eye(4))), table, *objects)
-    return PosedScene(things, plan.appearance)
+    return PosedScene(things, light_scene(plan, effects))

@@ -18,6 +18,7 @@ from schemas.scene.scene import Ground, ObjectStart, ScenePlan, Table
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Hull, Mesh
 from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import Catalogue, InstanceRef, choose_object, choose_table, load_asset
+from workers.assets.lights import draw_environment, draw_lights
 from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import hull_of
 from workers.physics.pour import Pouring, points_of
@@ -44,8 +45,21 @@ def plan_scene(job: Job, catalogue: Catalogue, chance: SceneChance) -> ScenePlan
     objects, table = choose_assets(job, catalogue, chance)
     assets = [load_asset(catalogue, ref) for ref in objects]
     if job.scene == "studio":
-        return draw_studio(job, chance, assets[0])
-    return draw_scene(job, chance, load_asset(catalogue, table), *assets)
+        plan = draw_studio(job, chance, assets[0])
+    else:
+        plan = draw_scene(job, chance, load_asset(catalogue, table), *assets)
+    return draw_look(job, catalogue, chance, plan)
+
+
+def draw_look(job: Job, catalogue: Catalogue, chance: SceneChance, plan: ScenePlan) -> ScenePlan:
+    """The plan with what the job's look draws, each from a stream of its own."""
+    lights, environment = job.look.lights, job.look.environment
+    if lights is not None:
+        plan = replace(plan, lights=draw_lights(chance.stream(Stream.LIGHTS), lights))
+    if environment is not None:
+        drawn = draw_environment(chance.stream(Stream.ENVIRONMENT), environment, catalogue.maps)
+        plan = replace(plan, environment=drawn)
+    return plan
 
 
 def choose_assets(job: Job, catalogue: Catalogue, chance: SceneChance) -> tuple[list[InstanceRef], InstanceRef]:

@@ -1,5 +1,6 @@
 """The output of a scene: the images that its views leave, and its rows in each manifest table. Pure."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
@@ -181,9 +182,36 @@ def scene_row(context: WorkerContext, scene: Scene) -> Row:
         **columns_of_bodies(bodies),
         "settle_s": None if table is None else max(rest.settle_s for rest in scene.settled),
         "raycast_checked": scene.raycast_checked,
+        **look_columns(scene),
         "settings_digest": context.settings_digest,
         "bodies": bodies,
         "capture": None,
+    }
+
+
+def look_columns(scene: Scene) -> Row:
+    """What was drawn of the light that the job asks for, where it was used."""
+    lights = scene.plan.lights if scene.effects.runs("lights") else None
+    environment = scene.plan.environment if scene.effects.runs("environment") else None
+    return {
+        "lights": None
+        if lights is None
+        else [
+            {
+                "towards": light.direction.tolist(),
+                "color": list(light.color),
+                "temperature_k": kelvin,
+                "size_deg": math.degrees(light.size_rad or 0.0),
+            }
+            for light, kelvin in zip(lights.lights, lights.temperatures_k, strict=True)
+        ],
+        "environment": None
+        if environment is None
+        else {
+            "name": environment.source.name,
+            "sha256": environment.source.sha256,
+            "turn_deg": math.degrees(environment.turn_rad),
+        },
     }
 
 
