@@ -133,7 +133,7 @@ raycast_checked | bool | - | - | Whether every view was checked against the ray 
 settings_digest | string | - | - | SHA-256 of the settings and sources that shape a scene.
 lights | list of struct, look | - | - | The lights of `look.lights`; the first casts shadows.
 lights[].towards | double[3] | 1 | world | Unit vector towards it.
-lights[].color | double[3] | 1 | - | Radiance of a white surface that faces it, linear RGB.
+lights[].level | double | 1 | - | Light that it gives to a level white surface, of which 1 is white.
 lights[].temperature_k | double | K | - | Its colour temperature.
 lights[].size_deg | double | deg | - | Angle across it.
 environment | struct, look | - | - | The map of `look.environment`.

@@ -13,7 +13,7 @@ def _between(least: float, most: float) -> AfterValidator:
 
     def check(ends: Range) -> Range:
         if ends.low < least or ends.high > most:
-            raise ValueError(f"[{ends.low:g}, {ends.high:g}] must lie between {least:g} and {most:g}")
+            raise ValueError(f"must lie between {least:g} and {most:g}")
         return ends
 
     return AfterValidator(check)

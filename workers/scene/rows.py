@@ -20,6 +20,7 @@ from schemas.scene.view import MODALITIES, ObjectLabel, Pair, PixelKind, View, c
 from workers.assets.glb import asset_glb
 from workers.assets.samples import draw_samples, encode_samples
 from workers.geometry.camera import inclination, yaw
+from workers.geometry.irradiance import LUMINANCE
 from workers.geometry.pixels import measure_regions
 from workers.scene.context import WorkerContext
 from workers.scene.effects import write_receipt
@@ -199,7 +200,7 @@ def look_columns(scene: Scene) -> Row:
         else [
             {
                 "towards": light.direction.tolist(),
-                "color": list(light.color),
+                "level": float(np.dot(light.color, LUMINANCE) * light.direction[2]),
                 "temperature_k": kelvin,
                 "size_deg": math.degrees(light.size_rad or 0.0),
             }
