@@ -7,7 +7,7 @@ exposure of the drawn studio: a level white surface is just below what clips.
 import hashlib
 import io
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -27,8 +27,7 @@ from workers.geometry.frames import UP, rotation_about
 from workers.geometry.irradiance import (
     LUMINANCE,
     WORK_PX,
-    FittedLight,
-    Lobe,
+    LightMap,
     Map,
     even_directions,
     fit_light,
@@ -50,23 +49,13 @@ LIMITS = Limits(memory_mb=2048, cpu_s=120.0)
 REFUSAL = b"-"
 
 
-@dataclass(frozen=True, eq=False)
-class LightMap:
-    """A map at the exposure of a scene: radiance [HEIGHT, 2 HEIGHT, 3] float32, and its fitted irradiance."""
-
-    radiance: Map
-    fitted: FittedLight
-
-
 def expose_map(radiance: Map) -> LightMap:
     """The light of a map, scaled so that a level white surface has `ALBEDO_IN_LIGHT`, and none more than `MOST_EXPOSED`."""
     radiance = np.asarray(radiance / radiance.mean(dtype=np.float64), np.float32)
     normals = np.concatenate([np.array([UP]), even_directions(500)])
     received = irradiance(reduce_map(radiance, WORK_PX), normals) @ LUMINANCE
     scale = min(ALBEDO_IN_LIGHT / max(received[0], 1e-6), MOST_EXPOSED / received.max())
-    radiance = np.asarray(radiance * np.float32(scale), np.float32)
-    radiance.setflags(write=False)
-    return LightMap(radiance, fit_light(radiance, MOST_LIGHTS))
+    return fit_light(np.asarray(radiance * np.float32(scale), np.float32), MOST_LIGHTS)
 
 
 def open_maps(name: str | None, job_folder: Path) -> tuple[MapSource, ...]:
@@ -107,8 +96,7 @@ def load_map(source: MapSource) -> LightMap:
         raise MeshError("missing", message, "environmental")
     assert isinstance(answer, bytes)
     with np.load(io.BytesIO(answer), allow_pickle=False) as held:
-        lobes = tuple(Lobe(row[:3], row[3:6], float(row[6])) for row in held["lobes"])
-        return LightMap(held["radiance"], FittedLight(held["terms"], lobes, tuple(held["of_lobes"])))
+        return LightMap(**held)
 
 
 def _refusal(answer: bytes | Ended, file: MapSource) -> str | None:
@@ -139,21 +127,9 @@ def answer_map(file: MapSource) -> bytes:
         light = expose_map(read_radiance(file.path, file.sha256, HEIGHT))
     except InputError as error:
         return REFUSAL + str(error).encode()
-    fitted, stream = light.fitted, io.BytesIO()
-    lobes = np.array([[*lobe.direction, *lobe.color, lobe.size_rad] for lobe in fitted.lobes]).reshape(-1, 7)
-    of_lobes = np.array(fitted.of_lobes).reshape(-1, *fitted.terms.shape)
-    np.savez(stream, radiance=light.radiance, terms=fitted.terms, lobes=lobes, of_lobes=of_lobes)
+    stream = io.BytesIO()
+    np.savez(stream, **vars(light))
     return stream.getvalue()
-
-
-def surround_of(
-    light: LightMap, turn_rad: float, scale: float, most_lights: int, shown: bool
-) -> tuple[Surround, tuple[Light, ...]]:
-    """A map turned about the vertical and scaled, and the lights, at most so many, that stand for its bright parts."""
-    R, lobes = rotation_about(UP, turn_rad), light.fitted.lobes[:most_lights]
-    terms = frozen_array(turn_polynomials(scale * light.fitted.without(most_lights), R))
-    lights = tuple(Light(frozen_array(R @ p.direction), rgb(scale * p.color), p.size_rad, True) for p in lobes)
-    return Surround(light.radiance, terms, turn_rad, scale, shown), lights
 
 
 def relight(
@@ -161,7 +137,8 @@ def relight(
 ) -> Appearance:
     """The appearance with drawn lights, with a map in the place of all other light, or both.
 
-    The light that gives most to a level surface comes first. `shown`: whether the map is seen where no surface is.
+    The light that gives most to a level surface comes first: it casts shadows in tier raster. `shown`: whether the map is seen
+    where no surface is.
     """
     drawn, rest = base.lights, 1.0
     if lights is not None:
@@ -169,10 +146,13 @@ def relight(
     elif environment is not None:
         drawn = ()
     if environment is not None:
-        light = load_map(environment.source)
-        surround, parts = surround_of(light, environment.turn_rad, rest, MOST_LIGHTS - len(drawn), shown)
-        every = sorted((*drawn, *parts), key=lambda each: -float(np.dot(each.color, LUMINANCE)) * each.direction[2])
+        light, R = load_map(environment.source), rotation_about(UP, environment.turn_rad)
+        most = MOST_LIGHTS - len(drawn)
+        terms = frozen_array(turn_polynomials(rest * (light.terms - light.of_lights[:most].sum(axis=0)), R))
+        parts = zip(light.towards[:most] @ R.T, rest * light.colors, light.sizes_rad.tolist(), strict=False)
+        every = [*drawn, *(Light(frozen_array(n), rgb(color), size, True) for n, color, size in parts)]
+        every.sort(key=lambda each: -float(np.dot(each.color, LUMINANCE)) * each.direction[2])
         # A dark one keeps the maps of occlusion where nothing is bright.
         drawn = tuple(every) or (Light(frozen_array(UP), (0.0, 0.0, 0.0), None, True),)
-        base = replace(base, surround=surround)
+        base = replace(base, surround=Surround(light.radiance, terms, environment.turn_rad, rest, shown))
     return base if drawn is base.lights else replace(base, lights=drawn)

@@ -35,12 +35,18 @@ WORK_PX = 128
 
 
 @dataclass(frozen=True, eq=False)
-class Lobe:
-    """A bright part: direction [3] unit, color [3], the radiance of a white surface that faces it, and the angle across it."""
+class LightMap:
+    """A map, and its irradiance / pi as terms [TERMS, 3] of `polynomials`, of which lights stand for K bright parts.
 
-    direction: Array
-    color: Array
-    size_rad: float
+    towards [K, 3] unit; colors [K, 3], radiance of a white surface that faces each; sizes_rad [K]; of_lights [K, TERMS, 3].
+    """
+
+    radiance: Map
+    terms: Array
+    towards: Array
+    colors: Array
+    sizes_rad: Array
+    of_lights: Array
 
 
 def map_directions(height: int) -> Map:
@@ -101,72 +107,52 @@ def irradiance(radiance: Map, normals: Array) -> Array:
     return cosine.astype(np.float64) @ weighed
 
 
-@dataclass(frozen=True, eq=False)
-class FittedLight:
-    """terms [TERMS, 3]: irradiance / pi of a whole map; its bright parts as lights, and terms of each of them."""
-
-    terms: Array
-    lobes: tuple[Lobe, ...]
-    of_lobes: tuple[Array, ...]
-
-    def without(self, count: int) -> Array:
-        """[TERMS, 3]: what is left beside the first so many lights: together they are all of the light."""
-        return np.asarray(self.terms - sum(self.of_lobes[:count], np.zeros((TERMS, 3))), np.float64)
-
-
-def fit_light(radiance: Map, most: int) -> FittedLight:
-    """A map's irradiance as harmonics and lights, those that give most to a level surface first.
+def fit_light(radiance: Map, most: int) -> LightMap:
+    """A map's irradiance as harmonics and at most so many lights, those that give most to a level surface first.
 
     Of a wide bright part a light takes what the harmonics cannot hold, by least squares; of a small one all.
     """
     from scipy.optimize import lsq_linear  # a fifth of a second, of maps alone
 
     small, normals = reduce_map(radiance, WORK_PX), even_directions(FIT_NORMALS)
-    parts, light = _bright_parts(radiance, small, most), irradiance(small, normals)
-    basis, level = polynomials(normals), light @ LUMINANCE
-    weight = 1.0 / np.maximum(light, 0.02 * light.max(axis=0))
-    columns = [(p.color @ LUMINANCE) * np.maximum(normals @ p.direction, 0.0) for p in parts]
-    least = [0.999 if p.size_rad < SMALL_RAD else 0.0 for p in parts]
-    bounds = [-np.inf] * TERMS + least, [np.inf] * TERMS + [1.0] * len(parts)
-    matrix, green = np.column_stack([basis, *columns]), weight[:, 1]
-    shares = lsq_linear(matrix * green[:, None], level * green, bounds).x[TERMS:].tolist()
-    lobes = [Lobe(p.direction, share * p.color, p.size_rad) for p, share in zip(parts, shares, strict=True)]
-    strong = (lobe for lobe in lobes if lobe.color @ LUMINANCE > LEAST_SHARE * level.mean())
-    lobes = sorted(strong, key=lambda lobe: -float(lobe.color @ LUMINANCE * lobe.direction[2]))
+    towards, colors, sizes = _bright_parts(radiance, small, most)
+    light, basis, facing = irradiance(small, normals), polynomials(normals), np.maximum(normals @ towards.T, 0.0)
+    level, weight = light @ LUMINANCE, 1.0 / np.maximum(light, 0.02 * light.max(axis=0))
+    bounds = np.array([[-np.inf, np.inf]] * TERMS + [[0.999 * (size < SMALL_RAD), 1.0] for size in sizes]).T
+    matrix = np.column_stack([basis, facing * (colors @ LUMINANCE)]) * weight[:, 1:2]
+    colors = colors * lsq_linear(matrix, level * weight[:, 1], bounds).x[TERMS:, None]
+    bright = colors @ LUMINANCE
+    order = [k for k in np.argsort(-bright * towards[:, 2]) if bright[k] > LEAST_SHARE * level.mean()]
     inverses = [np.linalg.pinv(basis * weight[:, c : c + 1]) * weight[:, c] for c in range(3)]
-
-    def fit(values: Array) -> Array:
-        return np.stack([inverse @ values[:, c] for c, inverse in enumerate(inverses)], axis=1)
-
-    of_lobes = [fit(np.outer(np.maximum(normals @ lobe.direction, 0.0), lobe.color)) for lobe in lobes]
-    return FittedLight(fit(light), tuple(lobes), tuple(of_lobes))
+    terms = np.stack([inverse @ light[:, c] for c, inverse in enumerate(inverses)], axis=1)
+    of_lights = np.stack([(inverse @ facing).T * colors[:, c : c + 1] for c, inverse in enumerate(inverses)], axis=2)
+    return LightMap(radiance, terms, towards[order], colors[order], sizes[order], of_lights[order])
 
 
-def _bright_parts(radiance: Map, small: Map, most: int) -> list[Lobe]:
-    """The strongest connected bright parts, each with all of its light."""
-    times = len(radiance) // len(small)
-    light, angle, directions = radiance @ LUMINANCE, solid_angles(len(radiance)), map_directions(len(radiance))
+def _bright_parts(radiance: Map, small: Map, most: int) -> tuple[Array, Array, Array]:
+    """(towards [K, 3], colors [K, 3], sizes_rad [K]) of the strongest connected bright parts, each with all of its light."""
+    times, angle = len(radiance) // len(small), solid_angles(len(radiance)) * np.ones((1, 2 * len(radiance)))
+    light, directions = radiance @ LUMINANCE, map_directions(len(radiance)).astype(np.float64)
     left, small_angle = small @ LUMINANCE, np.broadcast_to(solid_angles(len(small)), small.shape[:2])
-    least, dark, parts = LEAST_SHARE * float((light * angle).sum()), np.zeros(left.shape, np.bool_), list[Lobe]()
+    least, dark, parts = LEAST_SHARE * float((light * angle).sum()), np.zeros(left.shape, np.bool_), list[Array]()
     while len(parts) < most:
-        mean = np.average(left[~dark], weights=small_angle[~dark])
-        labels = _connected(left > BRIGHT * mean)
+        labels = _connected(left > BRIGHT * np.average(left[~dark], weights=small_angle[~dark]))
         energy = np.bincount(labels.ravel(), (left * small_angle).ravel())
         energy[0] = 0.0
-        strongest = int(energy.argmax())
-        if energy[strongest] < least:
+        part = labels == energy.argmax()
+        if energy.max() < least:
             break
-        dark |= labels == strongest
-        left[labels == strongest] = 0.0
-        inside = np.kron(labels == strongest, np.ones((times, times), np.bool_))
-        weight, pixels = (angle * np.ones_like(light))[inside], radiance[inside].astype(np.float64)
-        towards = (directions[inside] * (light[inside] * weight)[:, None]).sum(axis=0)
-        flux = light[inside] @ weight
-        towards /= np.linalg.norm(towards)
-        color = (pixels * (weight * np.maximum(directions[inside] @ towards, 0.0))[:, None]).sum(axis=0) / math.pi
-        size_rad = 2.0 * math.sqrt(flux**2 / (light[inside] ** 2 @ weight) / math.pi)
-        parts.append(Lobe(towards.astype(np.float64), color, size_rad))
-    return parts
+        dark |= part
+        left[part] = 0.0
+        inside = np.kron(part, np.ones((times, times), np.bool_))
+        n, weight, bright = directions[inside], angle[inside], light[inside]
+        middle = (bright * weight) @ n
+        middle /= np.linalg.norm(middle)
+        color = (weight * np.maximum(n @ middle, 0.0)) @ radiance[inside].astype(np.float64) / math.pi
+        size_rad = 2.0 * math.sqrt((bright @ weight) ** 2 / (bright**2 @ weight) / math.pi)
+        parts.append(np.array([*middle, *color, size_rad]))
+    table = np.array(parts).reshape(-1, 7)
+    return table[:, :3], table[:, 3:6], table[:, 6]
 
 
 def _connected(mask: NDArray[np.bool_]) -> NDArray[np.int32]:
