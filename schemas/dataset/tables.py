@@ -63,8 +63,8 @@ class Column:
     null: bool = False
     """Whether the value may be missing where the column applies."""
     of: Of = "both"
-    """The kind of dataset that has it, null in others: `rest`, of scenes on a table; `more` and `look`, of jobs with
-    `cameras.more` or `look`. A table without any value of a column has the digest of one without the column."""
+    """The kind of dataset that has it, null in others: `rest`, of scenes on a table; `more`, of jobs with `cameras.more`;
+    `look`, of jobs with that. A table without any value of a column has the digest of one without the column."""
 
     @property
     def nullable(self) -> bool:
@@ -81,7 +81,7 @@ _SHARED = {
     "role": "Which view of its pair: input, aligned (the depth camera), mirror, or projected; or the name of a camera of "
     "`cameras.more`.",
     "number": "Number among the views of its role in the scene, from 0; null in the views that every pair has.",
-    "region": "The value of its pixels in segment images: 2 the table, 3 and up the objects.",
+    "region": "The value of its pixels in segment images: 2 the table, 3 and up the objects, 200 and up clutter.",
     "patch": "Share of the patch that shows its object; null where there is no patch.",
     "scale": "Factor from the source's coordinates to metres.",
     "overlap": "Deepest overlap of the true meshes at rest.",
@@ -131,15 +131,6 @@ equilibrium_residual | double, rest | 1 | - | {balance}
 settle_s | double, rest | s | - | Simulated time until rest; the longest of all objects.
 raycast_checked | bool | - | - | Whether every view was checked against the ray caster.
 settings_digest | string | - | - | SHA-256 of the settings and sources that shape a scene.
-lights | list of struct, look | - | - | The lights of `look.lights`; the first casts shadows.
-lights[].towards | double[3] | 1 | world | Unit vector towards it.
-lights[].level | double | 1 | - | Light that it gives to a level white surface, of which 1 is white.
-lights[].temperature_k | double | K | - | Its colour temperature.
-lights[].size_deg | double | deg | - | Angle across it.
-environment | struct, look | - | - | The map of `look.environment`.
-environment.name | string | - | - | Name of its file, or of a built-in sky or room.
-environment.sha256 | string? | - | - | SHA-256 of the file; null of a built-in one.
-environment.turn_deg | double | deg | - | Its turn about the vertical, counter-clockwise from above.
 bodies | list of struct, scenes | - | - | Every object; above stand names and pose of the first, the worst figures of all.
 bodies[].region_id | int64 | id | - | {region}
 bodies[].category | string | - | - | {category}
@@ -162,6 +153,25 @@ bodies[].contacts[].with_region | int64 | id | - | The region that it touches th
 bodies[].contacts[].point | double[3] | m | world | Where it touches.
 bodies[].contacts[].normal | double[3] | 1 | world | Unit normal towards the object.
 bodies[].contacts[].force | double[3] | N | world | Force on the object.
+surroundings | struct, look | - | - | What was drawn of the surroundings in `look`; null fields are as built in.
+surroundings.floor | string? | - | - | Picture of the floor, below its folder, or sRGB colour.
+surroundings.floor_tile_m | double? | m | - | Width of that picture on the floor.
+surroundings.table | string? | - | - | Picture of the table, below its folder, or sRGB colour.
+surroundings.table_tile_m | double? | m | - | Width of that picture on the table.
+surroundings.background | string? | - | - | Picture behind everything, below its folder.
+surroundings.room_m | list of double? | m | world | Length along x, width along y, and height of the room inside.
+surroundings.lights | list of struct? | - | - | Lights of `look.lights`; the first casts shadows.
+surroundings.lights[].towards | list of double | 1 | world | Unit vector towards it.
+surroundings.lights[].level | double | 1 | - | Light that it gives to a level white surface, of which 1 is white.
+surroundings.lights[].temperature_k | double | K | - | Its colour temperature.
+surroundings.lights[].size_deg | double | deg | - | Angle across it.
+surroundings.environment | string? | - | - | Map of `look.environment`: name of its file, or of a built-in sky or room.
+surroundings.environment_deg | double? | deg | - | Its turn about the vertical, counter-clockwise from above.
+surroundings.clutter | list of struct? | - | - | Objects that have no other row, in images, masks and depth alone.
+surroundings.clutter[].region_id | int64 | id | - | {region}
+surroundings.clutter[].category | string | - | - | {category}
+surroundings.clutter[].instance_id | string | - | - | {instance}
+surroundings.clutter[].T_world_obj | double[16] | m | world, object | Pose at rest.
 capture | struct, captures | - | - | Quality of the capture.
 capture.name | string | - | - | Name of its folder.
 capture.estimate | string | - | - | Which estimate of the camera poses was taken: markers, article or joint.

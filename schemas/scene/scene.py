@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from schemas.base import Array, Pose
-from schemas.scene.shape import Appearance, Asset, Hull, Light, MapSource, Mesh, Shape
+from schemas.scene.shape import REGION_FIRST_CLUTTER, Appearance, Asset, Hull, Mesh, Shape
 from schemas.scene.view import Camera, NamedCamera
 
 EffectKind = Literal["asked", "no_op", "approximation"]
@@ -64,11 +64,22 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False)
+class Walls:
+    """The walls of a room about the world's origin: their shape, and its length along x, width along y, and height, inside."""
+
+    shape: Shape
+    size_m: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Ground:
-    """What carries the objects of a scene: a table, on a floor."""
+    """What carries the objects of a scene: a table, on a floor, in a room if the job asks for it."""
 
     table: Table
     floor: Shape
+    walls: Walls | None = None
+    cover: Shape | None = None
+    """The table as it is drawn, where the job gives it another surface: the same faces in the same order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,27 +97,10 @@ class ObjectStart:
     placed: bool
     """Whether it was set down in a stable pose and needs no drop."""
 
-
-@dataclass(frozen=True, eq=False)
-class DrawnLights:
-    """Lights of `look.lights` and what goes with them: `ambient` from above and `below` from below, linear RGB.
-
-    temperatures_k: colour temperature of each light; rest: the share of all light that is not theirs, times the total.
-    """
-
-    lights: tuple[Light, ...]
-    temperatures_k: tuple[float, ...]
-    rest: float
-    ambient: tuple[float, float, float]
-    below: tuple[float, float, float]
-
-
-@dataclass(frozen=True, eq=False)
-class DrawnEnvironment:
-    """The map of `look.environment` and its turn, counter-clockwise from above."""
-
-    source: MapSource
-    turn_rad: float
+    @property
+    def is_clutter(self) -> bool:
+        """Whether it has no rows."""
+        return self.region_id >= REGION_FIRST_CLUTTER
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,10 +117,13 @@ class ScenePlan:
     appearance: Appearance
     more: tuple[NamedCamera, ...] = ()
     """Further cameras that stand by themselves; known where the objects rest."""
-    lights: DrawnLights | None = None
-    """In the place of the lights of `appearance`."""
-    environment: DrawnEnvironment | None = None
-    """In the place of all light from around."""
+    surroundings: Mapping[str, object] | None = None
+    """What was drawn of `look`, by the fields of `scenes.surroundings`; None where nothing was asked for."""
+
+    @property
+    def shown(self) -> tuple[ObjectStart, ...]:
+        """The objects that have rows; clutter comes after them."""
+        return tuple(start for start in self.objects if not start.is_clutter)
 
     @property
     def table(self) -> Table:

@@ -20,7 +20,7 @@ from schemas.base import Array
 from schemas.errors import InputError
 from schemas.job.views import Render
 from schemas.scene.scene import Ground, Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
+from schemas.scene.shape import REGION_FLOOR, is_object
 from schemas.scene.view import Camera, Intrinsics
 from workers.assets.appearance import draw_appearance
 from workers.geometry.camera import NEAR_M, project, project_bounds, unproject
@@ -31,7 +31,8 @@ from workers.render.tiers import require_tier
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.context import WorkerContext
 from workers.scene.effects import Facts, plan_effects
-from workers.scene.make_scene import Scene, light_scene
+from workers.scene.make_scene import Scene
+from workers.scene.surround import light_scene
 
 Box = tuple[float, float, float, float]
 """(left, top, right, bottom)."""
@@ -120,7 +121,7 @@ class Eye:
 
     def vertices(self) -> Array:
         """[V, 3] float64: the vertices of the objects, which are all things but floor and table."""
-        objects = [thing for thing in self.things if thing.region_id >= REGION_FIRST_OBJECT]
+        objects = [thing for thing in self.things if is_object(thing.region_id)]
         vertices = [transform(thing.T_world_shape, thing.shape.vertices) for thing in objects]
         return np.concatenate([np.empty((0, 3)), *vertices])
 
@@ -158,7 +159,7 @@ def cast_patch(things: Sequence[Placed], camera: Camera, *names: int) -> Patch:
     cell = ((right - left) / DENSE, (bottom - top) / DENSE)
     rows, columns = (index.ravel() for index in np.mgrid[0:DENSE, 0:DENSE])
     depth_m, region = eye.cast(left + cell[0] * (columns + 0.5), top + cell[1] * (rows + 0.5))
-    mine = region >= REGION_FIRST_OBJECT
+    mine = is_object(region)
     if not mine.any():
         return NOTHING
     rows, columns, dense_m = rows[mine], columns[mine], float(depth_m[mine].min())
@@ -176,7 +177,7 @@ def cast_patch(things: Sequence[Placed], camera: Camera, *names: int) -> Patch:
 
 def seen_by_other(things: Sequence[Placed], camera: Camera, seen: Seen, other: Camera) -> NDArray[np.bool_]:
     """[N] bool: whether the object point that each ray hits is visible in the other camera's image too."""
-    mine = np.flatnonzero(seen.region >= REGION_FIRST_OBJECT)
+    mine = np.flatnonzero(is_object(seen.region))
     points = unproject(seen.rows[mine], seen.columns[mine], seen.depth_m[mine], camera.intrinsics)
     there = transform(invert(other.T_world_cam) @ camera.T_world_cam, points)
     before = there[:, 2] > NEAR_M
@@ -238,8 +239,9 @@ def converged_colour(context: WorkerContext, scene: Scene, crop: Crop, paths: in
     that the raster and path-traced tiers share, and a seed of its own.
     """
     # As the path-traced tier draws it: the flat tier has another floor and other lights.
-    chance = SceneChance(context.job.seed, scene.plan.scene_id).stream(Stream.APPEARANCE)
-    floor, appearance = draw_appearance(chance, "pathtraced")
+    chance = SceneChance(context.job.seed, scene.plan.scene_id)
+    floor, appearance = draw_appearance(chance.stream(Stream.APPEARANCE), "pathtraced")
+    appearance, _ = light_scene(context.job.look, context.catalogue, chance, appearance, True)
     plan = replace(scene.plan, ground=Ground(scene.plan.table, floor), appearance=appearance)
     things = [
         Placed(thing.region_id, floor, thing.T_world_shape) if thing.region_id == REGION_FLOOR else thing
@@ -249,7 +251,7 @@ def converged_colour(context: WorkerContext, scene: Scene, crop: Crop, paths: in
     effects = plan_effects(Facts(context.job.model_copy(update={"render": render}), plan, False))
     camera = crop_camera(scene.pairs[0].input.camera, crop)
     rng = np.random.default_rng([TRUTH_SEED, scene.plan.scene_id])
-    drawn = draw_view(context.renderer, things, light_scene(plan, effects), camera, render, lambda: rng, effects)
+    drawn = draw_view(context.renderer, things, appearance, camera, render, lambda: rng, effects)
     assert drawn.rgb is not None
     return drawn.rgb
 

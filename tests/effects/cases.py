@@ -5,8 +5,10 @@ Effects of physics have theirs in physics_cases.py.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, get_args
 
+from schemas.job.look import Look
 from schemas.job.views import ViewTarget
 from tests.effects.scenes import ABOVE_THE_HORIZON, Setting, merged, with_holes, without_textures
 
@@ -37,6 +39,31 @@ def _target(name: str) -> Case:
     return _asked({"targets": views[0]}, {"targets": views[1]}, f"targets.views has no {name}")
 
 
+def _look(name: str, branch: str, value: Any) -> Case:
+    """Asked for; not where another branch is asked for."""
+    other = {"floor": {"colours": [RED]}} if branch != "floor" else {"table": {"colours": [RED]}}
+    usual = Look.model_fields[branch].default or "off"
+    return _asked({**BEHIND.get(name, {}), "look": {branch: value}}, {"look": other}, f"look.{branch} is {usual}")
+
+
+RED, BLUE = (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
+
+BEHIND = {"backdrop": ABOVE_THE_HORIZON}
+"""Keys of a scene in which the effect is seen, where any other scene does not show it."""
+
+PICTURES = str(Path(__file__).parents[2] / "docs" / "images")
+
+SURROUNDINGS: dict[str, tuple[str, Any]] = {
+    "recolour": ("recolour", {"hue": [[0.6, 0.65]]}),
+    "floor_cover": ("floor", {"colours": [RED]}),
+    "table_cover": ("table", {"colours": [BLUE]}),
+    "backdrop": ("background", PICTURES),
+    "room": ("room", {"size_m": [4.5, 5.0]}),
+    "clutter": ("clutter", {"count": 2}),
+    "lights": ("lights", {}),
+    "environment": ("environment", {"built_in": ["softboxes"]}),
+}
+
 NOISY = {
     "sensor": {"depth_noise": {}},
     "cameras": {"sensor": {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 320.0, "cy": 240.0}},
@@ -49,10 +76,6 @@ WITHOUT_MIRROR = {"cameras": {"mirror": {"enabled": False}}, "images": {"project
 STUDIO: dict[str, Any] = {"scene": "studio"}
 FRAMED: dict[str, Any] = {"cameras": {"orbit": {"radius_m": 1.0}}}
 AROUND: dict[str, Any] = {"cameras": {"more": [{"name": "around", "ring": {"count": 3}}]}}
-
-LOOKS: dict[str, Any] = {name: {"look": {name: branch}} for name, branch in (
-    ("lights", {}), ("environment", {"built_in": ["softboxes"]}),
-)}  # fmt: skip
 
 ASKED: dict[str, Case] = {
     "depth_camera": _asked({}, {"cameras": {"depth": {"enabled": False}}}, "cameras.depth.enabled is false"),
@@ -78,7 +101,7 @@ ASKED: dict[str, Case] = {
     "release_again": _asked({"check": {"raycast_share": 1.0}}, {}, "not in the share check.raycast_share"),
     **{name: _target(name) for name in TARGETS},
     "further_views": _asked({**STUDIO, **merged(FRAMED, AROUND)}, {**STUDIO, **FRAMED}, "cameras.more is empty"),
-    **{name: _asked(look, {**look, **FLAT}, "render.tier is flat") for name, look in LOOKS.items()},
+    **{name: _look(name, branch, value) for name, (branch, value) in SURROUNDINGS.items()},
     "alpha": _asked(
         {**STUDIO, **FRAMED},
         {**STUDIO, **FRAMED, "studio": {"background": [0.0, 0.0, 0.0]}},
@@ -86,7 +109,7 @@ ASKED: dict[str, Case] = {
     ),
 }
 
-OF_OTHERS = {*TARGETS, *LOOKS, "further_views", "alpha"}
+OF_OTHERS = {*TARGETS, *SURROUNDINGS, "further_views", "alpha"}
 """Effects that the receipt of a job does not name which has nothing of their kind."""
 
 NO_OPS: dict[str, Case] = {

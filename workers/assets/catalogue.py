@@ -28,12 +28,14 @@ from schemas.job.assets import (
     instance_id,
 )
 from schemas.job.job import differing_keys
+from schemas.job.look import Recolour
 from schemas.scene.shape import Asset, MapSource
 from workers.assets.poses import PoseFile
 from workers.geometry.frames import add_up
 
 if TYPE_CHECKING:
     from workers.assets.library.table import Library
+    from workers.assets.pictures import Pictures
 
 AnySource = ProceduralSource | LibrarySource
 
@@ -77,6 +79,10 @@ class Catalogue:
     """Tables of camera poses by the name of their camera; the digest covers them too."""
     maps: tuple[MapSource, ...] = ()
     """Maps of light of the folder that `look.environment` names; the digest covers them too."""
+    recolour: Recolour = "as_made"
+    """Colours of built-in objects; the digest covers them too."""
+    pictures: "Pictures" = field(default_factory=dict)
+    """Those of the folders of `look`; the digest covers them too."""
 
     def offers(self, category: str) -> list[tuple[int, AnySource, int]]:
         """Number, settings and count of instances of every source that has this category."""
@@ -160,8 +166,10 @@ class Catalogue:
         settings, library = self._sources(ref.category)[ref.source]
         if isinstance(settings, ProceduralSource):
             from workers.assets.builtin.make import make_asset
+            from workers.assets.recolour import recoloured
 
-            return make_asset(ref.category, settings, ref.index, self.assets.density_of(ref.category))
+            asset = make_asset(ref.category, settings, ref.index, self.assets.density_of(ref.category))
+            return asset if ref.category == TABLE else recoloured(asset, self.recolour)
         from workers.assets.library.shapes import load_shape
 
         assert library is not None
@@ -288,7 +296,7 @@ def choose_table(catalogue: Catalogue, rng: np.random.Generator) -> InstanceRef:
 
 def load_asset(catalogue: Catalogue, ref: InstanceRef) -> Asset:
     """The asset, from this process's cache if it is there; MeshError where its mesh is refused."""
-    key = (catalogue.digest, ref)
+    key = (catalogue.digest, catalogue.recolour, ref)
     if key in _cache:
         return _cache[key]
     asset, settings = catalogue.load(ref), catalogue.settings(ref)
@@ -306,7 +314,7 @@ def asset_bytes(asset: Asset) -> int:
     return total
 
 
-def open_cache(capacity_bytes: int) -> LRUCache[tuple[str, InstanceRef], Asset]:
+def open_cache(capacity_bytes: int) -> LRUCache[tuple[str, Recolour, InstanceRef], Asset]:
     """An LRU cache of assets. An asset larger than the capacity counts as the capacity, so that one is always kept."""
     return LRUCache(capacity_bytes, getsizeof=lambda asset: min(asset_bytes(asset), capacity_bytes))
 

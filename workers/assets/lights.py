@@ -1,17 +1,41 @@
 """The light that a job's `look` asks for, as it is drawn for a scene: lights from ranges, and which map of light."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from schemas.base import Array, Range, frozen_array
 from schemas.job.look import BUILT_IN, Environment, Lights
-from schemas.scene.scene import DrawnEnvironment, DrawnLights
 from schemas.scene.shape import Light, MapSource
 from workers.assets.appearance import ALBEDO_IN_LIGHT
 from workers.geometry.irradiance import LUMINANCE
 
 RGB = tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnLights:
+    """Lights, and what goes with them: `ambient` from above and `below` from below, linear RGB.
+
+    temperatures_k: colour temperature of each light; rest: the share of all light that is not theirs, times the total.
+    """
+
+    lights: tuple[Light, ...]
+    temperatures_k: tuple[float, ...]
+    rest: float
+    ambient: RGB
+    below: RGB
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnEnvironment:
+    """A map, and its turn, counter-clockwise from above."""
+
+    source: MapSource
+    turn_rad: float
+
+
 XYZ_TO_RGB = np.array(
     [[3.2406255, -1.537208, -0.4986286], [-0.9689307, 1.8757561, 0.0415175], [0.0557101, -0.2040211, 1.0569959]]
 )
@@ -59,6 +83,19 @@ def draw_lights(rng: np.random.Generator, spec: Lights) -> DrawnLights:
     rest = (1.0 - share) * total
     below = rest * rng.uniform(0.45, 0.7)
     return DrawnLights(tuple(lights), tuple(temperatures), rest / ALBEDO_IN_LIGHT, (rest,) * 3, (below,) * 3)
+
+
+def describe_lights(drawn: DrawnLights) -> list[dict[str, object]]:
+    """Lights by the fields of `scenes.surroundings.lights`."""
+    return [
+        {
+            "towards": light.direction.tolist(),
+            "level": float(np.dot(light.color, LUMINANCE) * light.direction[2]),
+            "temperature_k": kelvin,
+            "size_deg": math.degrees(light.size_rad or 0.0),
+        }
+        for light, kelvin in zip(drawn.lights, drawn.temperatures_k, strict=True)
+    ]
 
 
 def draw_environment(rng: np.random.Generator, spec: Environment, maps: tuple[MapSource, ...]) -> DrawnEnvironment:

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from schemas.capture import CaptureListing, Reconstruction
 from schemas.errors import AssetSourceError, CaptureError, InputError, command_line
 from schemas.job.job import Job
+from schemas.job.look import RECOLOUR_VERSION
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
 from workers.assets.environment import open_maps
 from workers.assets.poses import open_poses
@@ -30,6 +31,9 @@ from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_O
 from workers.capture.truth import TRUTH
 from workers.door.meshes.ply import Element, encode_ply, parse_ply
 from workers.door.opening import as_refusal
+
+if TYPE_CHECKING:
+    from workers.assets.pictures import Pictures
 
 PROCESS_FILE, CLOUD_FILE, MESH_FILE, POSES_FILE = "process.json", "cloud.ply", "mesh.ply", "poses.parquet"
 
@@ -165,13 +169,26 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
 
     `watch` is told now and then how far it is. Raises AssetSourceError that names the key of a folder that cannot be used.
     """
-    catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories), watch)
-    if poses := open_poses(job, job_folder):
-        whole = "\n".join([catalogue.digest, *(file.sha256 for file in poses.values())])
-        catalogue = replace(catalogue, poses=poses, digest=hashlib.sha256(whole.encode()).hexdigest())
-    if job.look.environment is not None and (maps := open_maps(job.look.environment.folder, job_folder)):
-        whole = "\n".join([catalogue.digest, *(f"{source.name} {source.sha256}" for source in maps)])
-        catalogue = replace(catalogue, maps=maps, digest=hashlib.sha256(whole.encode()).hexdigest())
+    look, categories = job.drawn_look, {*job.categories, *((job.look.clutter and job.look.clutter.categories) or ())}
+    catalogue = open_catalogue(job.assets, job_folder, tuple(categories), watch)
+    poses = open_poses(job, job_folder)
+    pictures: Pictures = {}
+    further = [file.sha256 for file in poses.values()]
+    if look.folders:
+        from workers.assets.pictures import open_pictures
+
+        pictures = open_pictures(look, job_folder)
+        further += [f"{key} {one.name} {one.sha256}" for key, some in pictures.items() for one in some]
+    around = job.look.environment  # also of tier flat: a study compares it with the path-traced tier
+    maps = () if around is None else open_maps(around.folder, job_folder)
+    further += [f"{source.name} {source.sha256}" for source in maps]
+    if look.recolour != "as_made":
+        further.append(f"recolour {look.model_dump_json(include={'recolour'})} {RECOLOUR_VERSION}")
+    if further:
+        whole = "\n".join([catalogue.digest, *further])
+        digest = hashlib.sha256(whole.encode()).hexdigest()
+        catalogue = replace(catalogue, poses=poses, pictures=pictures, maps=maps)
+        catalogue = replace(catalogue, recolour=look.recolour, digest=digest)
     if job.captures is None or not job.captures.folders:
         return catalogue
     listings, folders = [], job.captures.folders

@@ -115,7 +115,7 @@ def _without_lost(drop: Drop, lost: LostError, again: dict[int, int]) -> Drop:
     """
     pouring, starts = drop.pouring, list(moved_to(drop.starts, lost.poses))
     kept = [number for number in range(len(starts)) if number not in lost.numbers]
-    if pouring.remove and kept and lost.reason != "thrown":
+    if pouring.remove and not all(starts[number].is_clutter for number in kept) and lost.reason != "thrown":
         lying, ready = (frozenset(kept.index(n) for n in kept if n in some) for some in (lost.fallen, drop.ready))
         clear_m = tuple(drop.clearances_m[number] for number in kept) if drop.clearances_m else ()
         fewer = renumbered([starts[number] for number in kept])
@@ -320,7 +320,7 @@ def _settle_alone(
         except LostError as lost:
             if pouring.draw is not None and not alone:
                 raise LeftRoomError from None  # a new start has another room
-            if not pouring.remove or (start is plan.objects[-1] and not began) or lost.reason == "thrown":
+            if not pouring.remove or (start is plan.shown[-1] and not began) or lost.reason == "thrown":
                 raise
             continue
         began += starts

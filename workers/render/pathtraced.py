@@ -44,6 +44,7 @@ from schemas.scene.view import Camera, GBuffer, Intrinsics
 from workers.geometry.camera import NEAR_M
 from workers.geometry.colour import HOLE_ALPHA, SRGB_STEPS, decode_srgb, encode_codes, has_holes
 from workers.geometry.frames import UP, pose, rotation_about, transform
+from workers.geometry.pixels import fill_image
 from workers.render.raster.batches import MATTE_ROUGHNESS, texture_of
 from workers.render.raster.gbuffer import Renderer
 from workers.render.raster.lit_shaders import KNEE
@@ -331,13 +332,13 @@ class Tracer:
         kind = "volpath" if built.clear else "path"
         bounces = render.path_bounces if effects.runs("global_illumination") else 1
         integrator = {"type": kind, "max_depth": bounces + 1, "rr_depth": ROULETTE_DEPTH}
-        shown = appearance.surround is not None and appearance.surround.shown
+        shown = appearance.surround is not None and appearance.surround.shown and appearance.backdrop is None
         integrator |= {"hide_emitters": not shown}
         traced = {"sensor": self.sensor(camera), "integrator": self._mi.load_dict(integrator), "seed": seed}
         image = self._mi.render(built.scene, spp=round_up_samples(render.path_samples), **traced)
         pixels = np.array(image, np.float64)
         covered = np.clip(pixels[..., 3:], 0.0, 1.0)
-        light = pixels[..., :3] + (1.0 - covered) * np.array(appearance.background)
+        light = pixels[..., :3] + (1.0 - covered) * _behind(appearance, *covered.shape[:2])
         return average(light, camera.intrinsics)
 
     def build(self, things: Sequence[Placed], appearance: Appearance, effects: EffectPlan) -> TracedScene:
@@ -378,6 +379,13 @@ class Tracer:
                 "sampler": {"type": "multijitter"},
             }
         )
+
+
+def _behind(appearance: Appearance, height: int, width: int) -> Array:
+    """[3] or [height, width, 3] linear light where nothing is."""
+    if appearance.backdrop is None:
+        return np.array(appearance.background)
+    return np.asarray(SRGB_STEPS[fill_image(appearance.backdrop, width, height)], np.float64)
 
 
 @cache

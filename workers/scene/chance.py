@@ -33,6 +33,8 @@ class Stream(IntEnum):
     MIRROR = 20
     LIGHTS = 21
     ENVIRONMENT = 22
+    SURROUNDINGS = 23
+    CLUTTER = 24
 
 
 _SENSORS = {"depth_noise": Stream.SENSOR_DEPTH, "rgb_noise": Stream.SENSOR_RGB, "exposure": Stream.SENSOR_EXPOSURE}

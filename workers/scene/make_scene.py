@@ -8,9 +8,8 @@ import numpy as np
 
 from schemas.base import frozen_array
 from schemas.scene.scene import EffectPlan, Placed, PosedScene, ScenePlan, Settled
-from schemas.scene.shape import REGION_FLOOR, REGION_TABLE, Appearance
+from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
 from schemas.scene.view import Pair, View
-from workers.assets.environment import relight
 from workers.physics.settle import Rest, recheck_scene, settle_scene
 from workers.scene.cameras import frame_cameras, place_more
 from workers.scene.chance import SceneChance
@@ -20,6 +19,7 @@ from workers.scene.pairs import SettledScene, make_further, make_pair
 from workers.scene.plan import plan_scene, pouring_of
 from workers.scene.ray_check import check_pair
 from workers.scene.studio import stand_alone
+from workers.scene.surround import look_without, surround
 from workers.stopwatch import Stopwatch
 
 
@@ -71,8 +71,11 @@ def make_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> S
 def plan_with_effects(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> tuple[ScenePlan, EffectPlan]:
     """What chance decides, and the effects that it calls for. Raises SceneError."""
     job, chance = context.job, SceneChance(context.job.seed, scene_id)
+    look = look_without(job.drawn_look, context.withdrawn)
     with stopwatch.stage("assets"):
-        plan = plan_scene(job, context.catalogue, chance)
+        catalogue = replace(context.catalogue, recolour=look.recolour)
+        plan = plan_scene(job, catalogue, chance)
+        plan = surround(job, look, catalogue, chance, plan)
     with stopwatch.stage("plan"):
         facts = Facts(job, plan, is_raycast_scene(job.check, chance))
         return plan, plan_effects(facts, context.forced).without(*context.withdrawn)
@@ -97,17 +100,19 @@ def lay_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> La
 
 def place_cameras(context: WorkerContext, plan: ScenePlan, rest: Rest) -> ScenePlan:
     """The plan with the cameras that follow from where its objects rest. Raises ViewError."""
-    poses = [each.T_world_obj for each in rest.settled]
-    plan = frame_cameras(context.job, plan, poses)
+    shown = replace(plan, objects=plan.shown)
+    poses = [each.T_world_obj for each in rest.settled[: len(shown.objects)]]
+    framed = frame_cameras(context.job, shown, poses)
     chance = SceneChance(context.job.seed, plan.scene_id)
-    return replace(plan, more=tuple(place_more(context.job, chance, plan, poses, context.catalogue.poses)))
+    more = tuple(place_more(context.job, chance, framed, poses, context.catalogue.poses))
+    return replace(framed, objects=plan.objects, more=more)
 
 
 def render_scene(context: WorkerContext, laid: Laid, stopwatch: Stopwatch) -> Scene:
     """Render, derive, check: all after physics. Raises SceneError."""
     job, chance = context.job, SceneChance(context.job.seed, laid.plan.scene_id)
     plan, effects, rest = laid.plan, laid.effects, laid.rest
-    posed = pose_scene(plan, rest.settled, effects)
+    posed = pose_scene(plan, rest.settled)
     scene = SettledScene(context, chance, plan, posed, effects, stopwatch)
     with stopwatch.stage("render", "light_maps" if effects.runs("light_maps") else None):
         context.renderer.prepare_light(posed.things, posed.appearance, job.render, effects)
@@ -118,21 +123,16 @@ def render_scene(context: WorkerContext, laid: Laid, stopwatch: Stopwatch) -> Sc
     return Scene(plan, rest.settled, posed, pairs, effects, rest.called, partial(make_further, scene))
 
 
-def light_scene(plan: ScenePlan, effects: EffectPlan) -> Appearance:
-    """Light and background as the plan and its effects have them. Raises MeshError where a map of light is gone."""
-    lights = plan.lights if effects.runs("lights") else None
-    environment = plan.environment if effects.runs("environment") else None
-    return relight(plan.appearance, lights, environment, plan.ground is not None)
-
-
-def pose_scene(plan: ScenePlan, settled: Sequence[Settled], effects: EffectPlan) -> PosedScene:
-    """Floor, table and objects where they rest, in order of region id, and their light."""
+def pose_scene(plan: ScenePlan, settled: Sequence[Settled]) -> PosedScene:
+    """Floor, table and objects where they rest, in order of region id."""
     objects = tuple(
         Placed(start.region_id, start.asset.shape, rest.T_world_obj)
         for start, rest in zip(plan.objects, settled, strict=True)
     )
     things = objects
     if plan.ground is not None:
-        table = Placed(REGION_TABLE, plan.table.asset.shape, plan.table.T_world_table)
-        things = (Placed(REGION_FLOOR, plan.floor, frozen_array(np.eye(4))), table, *objects)
-    return PosedScene(things, light_scene(plan, effects))
+        ground, still = plan.ground, frozen_array(np.eye(4))
+        table = Placed(REGION_TABLE, ground.cover or plan.table.asset.shape, plan.table.T_world_table)
+        walls = () if ground.walls is None else (Placed(REGION_FLOOR, ground.walls.shape, still),)
+        things = (Placed(REGION_FLOOR, plan.floor, still), *walls, table, *objects)
+    return PosedScene(things, plan.appearance)

@@ -1,6 +1,5 @@
 """The output of a scene: the images that its views leave, and its rows in each manifest table. Pure."""
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
@@ -20,7 +19,6 @@ from schemas.scene.view import MODALITIES, ObjectLabel, Pair, PixelKind, View, c
 from workers.assets.glb import asset_glb
 from workers.assets.samples import draw_samples, encode_samples
 from workers.geometry.camera import inclination, yaw
-from workers.geometry.irradiance import LUMINANCE
 from workers.geometry.pixels import measure_regions
 from workers.scene.context import WorkerContext
 from workers.scene.effects import write_receipt
@@ -95,7 +93,9 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
         assets = list({asset.instance_id: asset for asset in every}.values())
         files += [shape_file(asset) for asset in assets if asset.shareable]
     # Of objects alone: a table takes as long and as much room, and no network is trained to complete it.
-    sampled = [NO_SAMPLES] * len(table) + [*sample_assets(assets[len(table) :], context.job.targets, watch)]
+    end = len(table) + len({start.asset.instance_id for start in scene.plan.shown})
+    sampled = sample_assets(assets[len(table) : end], context.job.targets, watch)
+    sampled = [*[NO_SAMPLES] * len(table), *sampled, *[NO_SAMPLES] * (len(assets) - end)]
     files += [samples.file for samples in sampled if samples.file is not None]
     rows = {
         "scenes": [scene_row(context, scene)],
@@ -168,11 +168,35 @@ def file_columns(file: EncodedFile) -> Row:
     return {"path": file.path, "bytes": len(file.data), "sha256": file.sha256}
 
 
+SURROUNDINGS = (
+    *("floor", "floor_tile_m", "table", "table_tile_m", "background", "room_m"),
+    *("lights", "environment", "environment_deg"),
+)
+
+
+def surroundings_column(scene: Scene, job: Job) -> Row | None:
+    """What was drawn of the surroundings; None where the job asks for none."""
+    if scene.plan.surroundings is None:
+        return None
+    clutter = [
+        {
+            "region_id": start.region_id,
+            "category": start.asset.category,
+            "instance_id": start.asset.instance_id,
+            "T_world_obj": matrix_column(rest.T_world_obj),
+        }
+        for start, rest in zip(scene.plan.objects, scene.settled, strict=True)
+        if start.is_clutter
+    ]
+    return {**dict.fromkeys(SURROUNDINGS), **scene.plan.surroundings, "clutter": clutter}
+
+
 def scene_row(context: WorkerContext, scene: Scene) -> Row:
     """The row of `scenes`: names of the first object, and the worst figures of all objects."""
     ran, skipped = write_receipt(scene.effects, scene.called)
     table = None if scene.plan.ground is None else scene.plan.table
-    bodies = [body_columns(start, rest) for start, rest in zip(scene.plan.objects, scene.settled, strict=True)]
+    posed = list(zip(scene.plan.objects, scene.settled, strict=True))
+    bodies = [body_columns(start, rest) for start, rest in posed if not start.is_clutter]
     return {
         "scene_id": scene.plan.scene_id,
         "table_id": None if table is None else table.asset.instance_id,
@@ -183,36 +207,10 @@ def scene_row(context: WorkerContext, scene: Scene) -> Row:
         **columns_of_bodies(bodies),
         "settle_s": None if table is None else max(rest.settle_s for rest in scene.settled),
         "raycast_checked": scene.raycast_checked,
-        **look_columns(scene),
         "settings_digest": context.settings_digest,
         "bodies": bodies,
+        "surroundings": surroundings_column(scene, context.job),
         "capture": None,
-    }
-
-
-def look_columns(scene: Scene) -> Row:
-    """What was drawn of the light that the job asks for, where it was used."""
-    lights = scene.plan.lights if scene.effects.runs("lights") else None
-    environment = scene.plan.environment if scene.effects.runs("environment") else None
-    return {
-        "lights": None
-        if lights is None
-        else [
-            {
-                "towards": light.direction.tolist(),
-                "level": float(np.dot(light.color, LUMINANCE) * light.direction[2]),
-                "temperature_k": kelvin,
-                "size_deg": math.degrees(light.size_rad or 0.0),
-            }
-            for light, kelvin in zip(lights.lights, lights.temperatures_k, strict=True)
-        ],
-        "environment": None
-        if environment is None
-        else {
-            "name": environment.source.name,
-            "sha256": environment.source.sha256,
-            "turn_deg": math.degrees(environment.turn_rad),
-        },
     }
 
 

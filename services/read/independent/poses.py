@@ -14,6 +14,7 @@ import numpy as np
 from services.read.independent import derive
 from services.read.independent.cameras import Subject, beside_transform, check_stands, orbits_of
 from services.read.independent.derive import (
+    FIRST_CLUTTER,
     FIRST_OBJECT,
     ROUNDING,
     TABLE,
@@ -23,6 +24,7 @@ from services.read.independent.derive import (
     distance,
     matrix,
     name_of,
+    of_objects,
     things_of,
     unproject,
 )
@@ -42,7 +44,7 @@ def check_orbit(pair: StoredPair) -> Iterator[str]:
     low, high = np.sin(orbit["inclination_rad"])
     if isinstance(radius := orbit["radius_m"], str):
         share = FIT if radius == "fit" else float(radius.rstrip("% ")) / 100.0
-        seen = np.count_nonzero(pair.images["input", "region"] >= FIRST_OBJECT) / pair.images["input", "region"].size
+        seen = np.count_nonzero(of_objects(pair.images["input", "region"])) / pair.images["input", "region"].size
         off = 0.0 if seen <= FIT_SLACK * share else math.inf
     else:
         # The point looked at, where it is nearest to the vertical line through the centre, or as near as the radius allows.
@@ -119,7 +121,7 @@ def _subject(pair: StoredPair) -> Subject:
     """What named cameras are placed about. Raises FileNotFoundError without a shape's file."""
     world = {region: (shape.points.reshape(-1, 3), T) for region, shape, T in things_of(pair)}
     at = {region: points @ T[:3, :3].T + T[:3, 3] for region, (points, T) in world.items()}
-    objects = [region for region in world if region >= FIRST_OBJECT]
+    objects = [region for region in world if FIRST_OBJECT <= region < FIRST_CLUTTER]
     top_m = float(at[TABLE][:, 2].max()) if TABLE in at else 0.0
     nearest_m = pair.job["images"]["depth_range_m"][0]
     return Subject(np.concatenate([at[region] for region in objects]), top_m, nearest_m)
@@ -128,7 +130,7 @@ def _subject(pair: StoredPair) -> Subject:
 def _derive_d_z(pair: StoredPair) -> float:
     """Metres: a percentile (interpolated linearly) of the object's stored input depth."""
     mirror, depth = pair.job["cameras"]["mirror"], pair.images["input", "depth"]
-    z = np.sort(depth[(pair.images["input", "region"] >= FIRST_OBJECT) & (depth > 0)])
+    z = np.sort(depth[of_objects(pair.images["input", "region"]) & (depth > 0)])
     if not len(z):
         return math.nan
     units = np.interp(mirror["percentile"] / 100.0 * (len(z) - 1), np.arange(len(z)), z)
@@ -178,8 +180,16 @@ def list_underived(job: Mapping[str, Any]) -> list[str]:
         lines.append(f"poses of {', '.join(tables)} are not derived: a table of poses has them")
     if sensor["depth_noise"]:
         lines.append("depth is not compared with the floor's plane: sensor.depth_noise is on")
+    look = job.get("look", {})
+    if look.get("room"):
+        lines.append("walls are compared with the size of their room alone: their shape is in no file")
     if views := job.get("targets", {}).get("views"):
         lines += ["albedo of the floor is not derived: its look is in no file"] if "albedo" in views else []
+        lines += (
+            ["albedo of tables is not derived: look.table covers them"]
+            if "albedo" in views and look.get("table")
+            else []
+        )
         lines += ["covisible is derived at some of its pixels: 2,000 of a view at most"] if "covisible" in views else []
     return lines
 
@@ -304,7 +314,7 @@ def _check_reactions(bodies: list[Row]) -> Iterator[str]:
     forces = dict[tuple[int, int], Array]()
     for body in bodies:
         for contact in body["contacts"]:
-            if contact["with_region"] != TABLE:
+            if FIRST_OBJECT <= contact["with_region"] < FIRST_CLUTTER:
                 pair = (body["region_id"], contact["with_region"])
                 total = forces.setdefault(pair, np.zeros(3))
                 total += contact["force"]

@@ -166,8 +166,8 @@ def test_a_colour_temperature_is_that_of_plancks_law(kelvin):
     ("look", "message"),
     [
         ({"lights": {"number": [0, 3]}}, r"look.lights.number: \[0, 3\]: write a whole number from 1 to 6"),
-        ({"lights": {"elevation_deg": [-5, 40]}}, r"look.lights.elevation_deg: \[-5, 40\]: must lie between 1 and 90"),
-        ({"lights": {"temperature_k": 500}}, "must lie between 1700 and 25000"),
+        ({"lights": {"elevation_deg": [-5, 40]}}, r"look.lights.elevation_deg: \[-5, 40\]: must lie within 1 and 90"),
+        ({"lights": {"temperature_k": 500}}, "must lie within 1700 and 25000"),
         ({"environment": {"built_in": []}}, "look.environment.built_in"),
         ({"environment": {"built_in": ["moon"]}}, "clear_sky"),
     ],

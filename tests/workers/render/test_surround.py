@@ -7,11 +7,12 @@ import trimesh
 
 from schemas.base import frozen_array
 from schemas.job.look import BUILT_IN
-from schemas.scene.scene import DrawnEnvironment, Placed
+from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Appearance, Light, MapSource, Part, Shape
 from tests.workers.render.random_scenes import BLACK, EYE, FLAT, RASTER, camera, matte, paths, small, traced, without
 from workers.assets import environment
 from workers.assets.environment import expose_map, load_map, relight
+from workers.assets.lights import DrawnEnvironment
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import decode_codes
 from workers.geometry.frames import UP, rotation_about

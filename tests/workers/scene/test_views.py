@@ -267,7 +267,7 @@ def buffer(depth, region) -> GBuffer:
 def scene() -> PosedScene:
     job = Job.model_validate({"name": "t", "start": {"offset_m": [0, 0]}})
     plan = draw_scene(job, SceneChance(0, 0), table(), asset_of(box(0.2, 0.2, 0.25)))
-    return pose_scene(plan, (settle_single(plan.objects[0], plan.table, Job(name="t").physics),), EffectPlan((), {}))
+    return pose_scene(plan, (settle_single(plan.objects[0], plan.table, Job(name="t").physics),))
 
 
 @pytest.fixture(scope="module")
