@@ -117,6 +117,10 @@ class ScenePlan:
     appearance: Appearance
     more: tuple[NamedCamera, ...] = ()
     """Further cameras that stand by themselves; known where the objects rest."""
+    kept: bool = False
+    """Whether the objects stay where a table of scenes has them, at rest or not."""
+    aimed: bool = False
+    """Whether a table of scenes has the input cameras."""
     surroundings: Mapping[str, object] | None = None
     """What was drawn of `look`, by the fields of `scenes.surroundings`; None where nothing was asked for."""
 
@@ -142,9 +146,9 @@ class ScenePlan:
         return self.ground
 
 
-SupportedBy = Literal["flat_top", "mesh", "placed", "nothing"]
-"""The support of a drop: the table's flat top alone, its whole mesh, or none where the object was set down at rest; nothing
-in a studio scene."""
+SupportedBy = Literal["flat_top", "mesh", "placed", "kept", "nothing"]
+"""The support of a drop: the table's flat top alone, its whole mesh, or none where the object was set down at rest or is kept
+where a table of scenes has it; nothing in a studio scene."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from scipy.stats import t as student_t
 from schemas.base import Pose
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import is_shape, stored_images, stored_roles, stored_shape
-from schemas.errors import CorruptError, InputError, SceneError, command_line, plural
+from schemas.errors import CorruptError, InputError, SceneError, VersoError, command_line, plural
 from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan, ObjectStart, Placed, PosedScene, SceneOutput
 from schemas.scene.shape import Shape
@@ -26,6 +26,9 @@ from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, c
 from services.read.independent.derive import Kind, StoredPair
 from services.read.independent.poses import check_forces, check_merged, check_pair, list_underived
 from services.read.replay import compare_files, compare_rows, is_same_stack, open_context
+from services.read.scene_geometry import Sources
+from workers.assets.poses import PoseFile
+from workers.assets.scene_tables import read_scene
 from workers.geometry.camera import NEAR_M, project
 from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import edge_distance_px
@@ -33,7 +36,7 @@ from workers.physics.hold import release_again
 from workers.physics.settle import settle_scene
 from workers.render.raster.gbuffer import Renderer
 from workers.scene.context import WorkerContext
-from workers.scene.effects import EFFECTS, STUDIO, Facts, names_of_kind, plan_effects
+from workers.scene.effects import EFFECTS, UNFORCED, Facts, names_of_kind, plan_effects
 from workers.scene.make_scene import Scene, make_scene
 from workers.scene.rows import record_scene
 from workers.stopwatch import Stopwatch
@@ -210,6 +213,12 @@ def verify_independently(
     record = require_job(store)
     job = record.job.model_dump(mode="json")
     verdict, kinds = IndependentVerdict(underived=list_underived(job)), stored_kinds(record.job)
+    table: PoseFile | None = None
+    if record.job.scenes_from is not None:
+        try:
+            table = Sources(record).catalogue.scenes
+        except (VersoError, OSError):
+            verdict.underived.append("poses are not compared with scenes_from: it is not here, or not what it was")
     views: list[Row] = []
     objects: list[Row] = []
     for scene_id in choose_scenes(store, count, record.job.seed):
@@ -219,11 +228,17 @@ def verify_independently(
         assert scene is not None
         verdict.faults += check_forces(job, scene)
 
+        given = None
+        if table is not None:
+            rows = read_scene(table, scene_id)
+            objects_there = [(each.instance_id, None if each.of_source else each.T_world_obj) for each in rows.objects]
+            given = objects_there, [T for T, _ in rows.cameras]
+
         def read(path: str, images: ReadFile = images) -> bytes:
             return store.read(path) if is_shape(path) else images(path)
 
         for pair_views, pair_objects in stored.pairs(scene_id):
-            pair = StoredPair(job, scene, pair_views, pair_objects, read, kinds)
+            pair = StoredPair(job, scene, pair_views, pair_objects, read, kinds, given=given)
             try:
                 verdict.faults += check_pair(pair)
             except CorruptError as error:
@@ -305,7 +320,7 @@ def _audit_scene(context: WorkerContext, store: Store, scene_id: int, audited: A
     stored = find_scene(store, scene_id)
     row = stored.scene(scene_id)
     assert row is not None
-    forcible = {one["effect"] for one in row["skipped"] if not one["why"].startswith(STUDIO)}
+    forcible = {one["effect"] for one in row["skipped"] if not one["why"].startswith(UNFORCED)}
     left_out = sorted(forcible & audited.effects.keys())
     for name in left_out:
         audited.effects[name].skipped += 1

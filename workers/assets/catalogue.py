@@ -19,6 +19,7 @@ from schemas.capture import CaptureListing
 from schemas.errors import AssetSourceError, MeshError
 from schemas.job.assets import (
     BUILT_IN,
+    CATEGORIES,
     MOST_TOLD,
     TABLE,
     VERSION,
@@ -77,6 +78,8 @@ class Catalogue:
     """Folders of captures, in order; the digest covers their files too."""
     poses: Mapping[str, PoseFile] = field(default_factory=dict)
     """Tables of camera poses by the name of their camera; the digest covers them too."""
+    scenes: PoseFile | None = None
+    """The table of scenes that the job names; the digest covers it too."""
     maps: tuple[MapSource, ...] = ()
     """Maps of light of the folder that `look.environment` names; the digest covers them too."""
     recolour: Recolour = "as_made"
@@ -129,6 +132,21 @@ class Catalogue:
         if settings.diagonal_m is not None and category != TABLE:
             name += f"-{1000 * settings.diagonal_m:g}mm".replace(".", "_")
         return InstanceRef(number, category, index, name)
+
+    def find(self, name: str, tables: bool = False) -> InstanceRef | None:
+        """The instance of an object, or of a table, by its id; None where no source has it."""
+        stem, _, index = name.rpartition("-")
+        for number, (settings, library) in enumerate(self._sources(TABLE if tables else "")):
+            if library is not None:  # whose names may end in a size
+                places = [library.places[each] for each in (name, stem) if each in library.places]
+            else:
+                assert isinstance(settings, ProceduralSource)
+                known = index.isdecimal() and int(index) < settings.instances
+                places = [(category, int(index)) for category in ((TABLE,) if tables else CATEGORIES) if known]
+            for category, place in places:
+                if (category == TABLE) is tables and (ref := self.refer(number, category, place)).instance_id == name:
+                    return ref
+        return None
 
     def libraries(self) -> "list[Library]":
         """Those of all sources, each once."""

@@ -27,6 +27,7 @@ from schemas.job.look import RECOLOUR_VERSION
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
 from workers.assets.environment import open_maps
 from workers.assets.poses import open_poses
+from workers.assets.scene_tables import open_scenes
 from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW
 from workers.capture.truth import TRUTH
 from workers.door.meshes.ply import Element, encode_ply, parse_ply
@@ -171,9 +172,9 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
     """
     look, categories = job.drawn_look, {*job.categories, *((job.look.clutter and job.look.clutter.categories) or ())}
     catalogue = open_catalogue(job.assets, job_folder, tuple(categories), watch)
-    poses = open_poses(job, job_folder)
+    poses, scenes = open_poses(job, job_folder), open_scenes(job, job_folder)
     pictures: Pictures = {}
-    further = [file.sha256 for file in poses.values()]
+    further = [file.sha256 for file in (*poses.values(), scenes) if file is not None]
     if look.folders:
         from workers.assets.pictures import open_pictures
 
@@ -187,7 +188,7 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
     if further:
         whole = "\n".join([catalogue.digest, *further])
         digest = hashlib.sha256(whole.encode()).hexdigest()
-        catalogue = replace(catalogue, poses=poses, pictures=pictures, maps=maps)
+        catalogue = replace(catalogue, poses=poses, scenes=scenes, pictures=pictures, maps=maps)
         catalogue = replace(catalogue, recolour=look.recolour, digest=digest)
     if job.captures is None or not job.captures.folders:
         return catalogue

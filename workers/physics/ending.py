@@ -1,7 +1,8 @@
 """How a drop ends: what is measured of objects at rest, and why those are refused that do not rest."""
 
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,10 +12,18 @@ from schemas.job.physics import Physics
 from schemas.scene.scene import ObjectStart, Settled, SupportedBy
 from workers.geometry.frames import transform
 from workers.physics.fall import Outcome
-from workers.physics.placement import TOUCHING_M, Placement, Support, measure_supports
+from workers.physics.placement import (
+    FARTHEST_M,
+    TOUCHING_M,
+    Placement,
+    Support,
+    find_overlaps_m,
+    measure_supports,
+    placed_mesh,
+)
 from workers.physics.pour import LostError, moved_to, points_of
 from workers.physics.release import LEFT_M, Drop
-from workers.physics.support import inside_margin
+from workers.physics.support import inside_margin, vertical_gap
 
 UNBALANCED = 1e-3
 """Share of the weight, and of weight times size, that the contacts of what rests may leave unbalanced."""
@@ -123,21 +132,48 @@ def describe(ending: Ending) -> tuple[Settled, ...]:
         for number, held in enumerate(supports):
             _require_support(ending, number, held)
     support = _support_of(ending)
-    return tuple(
-        Settled(
-            T_world_obj=frozen_array(T),
-            penetration_mm=max(0.0, -held.gap_m) * 1e3,
-            hover_gap_mm=max(0.0, held.gap_m) * 1e3,
-            support_margin_mm=held.margin_m * 1e3,
-            equilibrium_residual=held.unbalanced,
-            residual_speed_mm_s=ending.speed_m_s * 1e3,
-            settle_s=ending.seconds,
-            support=support,
-            contacts=held.forces,
-            spun=ending.spun,
-        )
-        for T, held in zip(ending.poses, supports, strict=True)
+    return tuple(_settled(ending, T, held, support) for T, held in zip(ending.poses, supports, strict=True))
+
+
+def _settled(ending: Ending, T_world_obj: Pose, held: Support, support: SupportedBy) -> Settled:
+    return Settled(
+        T_world_obj=frozen_array(T_world_obj),
+        penetration_mm=max(0.0, -held.gap_m) * 1e3,
+        hover_gap_mm=max(0.0, held.gap_m) * 1e3,
+        support_margin_mm=held.margin_m * 1e3,
+        equilibrium_residual=held.unbalanced,
+        residual_speed_mm_s=ending.speed_m_s * 1e3,
+        settle_s=ending.seconds,
+        support=support,
+        contacts=held.forces,
+        spun=ending.spun,
     )
+
+
+def describe_kept(ending: Ending, most_mm: float) -> tuple[Settled, ...]:
+    """The figures of objects at poses that nothing led to.
+
+    What touches nothing hovers by the way straight down to what is below it. What is no body, and near no surface, counts as its
+    hull in the table. Raises SettleError where one is deeper in another, in the table or in the floor than `most_mm`.
+    """
+    starts, poses, forms = ending.drop.starts, (*ending.poses, np.eye(4)), ending.placement.forms
+    meshes = [*(placed_mesh(start, T) for start, T in zip(starts, poses, strict=False)), ending.drop.table.mesh]
+    names = [f"region {start.region_id} ({start.asset.instance_id})" for start in starts] + ["the table", "the floor"]
+    overlaps, kept, table = list(find_overlaps_m(forms, poses)), list[Settled](), len(starts)
+    for number, held in enumerate(measure_supports(ending.placement, ending.poses)):
+        within = {i + j - number: depth_m for i, j, depth_m in overlaps if number in (i, j) and depth_m > 0.0}
+        sunk_m = within.get(table, 0.0) if held.gap_m >= FARTHEST_M and forms[table].solid is not None else 0.0
+        lowest_m = float(meshes[number].vertices[:, 2].min())
+        gap_m = min(-sunk_m if sunk_m else held.gap_m, lowest_m)
+        within[table + 1] = -lowest_m
+        if gap_m > TOUCHING_M:
+            below = [vertical_gap(meshes[number], mesh) for n, mesh in enumerate(meshes) if n != number]
+            gap_m = min(lowest_m, *(way for way in below if way > 0.0), math.inf)
+        if gap_m < -most_mm / 1e3:
+            where = f"{names[number]} is {-gap_m * 1e3:.2f} mm inside {names[max(within, key=within.__getitem__)]}"
+            raise SettleError("overlap", f"{where}, and check.overlap_mm is {most_mm:g}: move it, or raise that")
+        kept.append(_settled(ending, ending.poses[number], replace(held, gap_m=gap_m), "kept"))
+    return tuple(kept)
 
 
 def _support_of(ending: Ending) -> SupportedBy:

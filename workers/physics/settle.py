@@ -17,8 +17,9 @@ from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled
 from workers.geometry.frames import translation
-from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for_with, rooms_m
-from workers.physics.ending import Ending, UnsupportedError, describe, require_calm
+from workers.geometry.mesh import join_meshes
+from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for, called_for_with, rooms_m
+from workers.physics.ending import Ending, UnsupportedError, describe, describe_kept, require_calm
 from workers.physics.exact_rest import rest
 from workers.physics.fall import Outcome
 from workers.physics.hold import RELEASE_RATE, hold, land, moved_by, release_again
@@ -326,6 +327,33 @@ def _settle_alone(
         began += starts
         settled += rests
     return renumbered(began), tuple(settled)
+
+
+def keep_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan, most_mm: float) -> Rest:
+    """The scene's objects where they were put, measured there: they need not rest. Clutter falls on them and on their table.
+
+    Raises as `describe_kept`; clutter that finds no rest is left out.
+    """
+    drop = Drop(plan.shown, plan.table, physics, effects)
+    poses = tuple(start.T_world_obj for start in drop.starts)
+    for start in drop.starts:
+        require_near_origin(start)
+    placement = _place(drop, poses, forms_of(drop.starts))
+    kept, clutter = describe_kept(Ending(drop, placement, poses), most_mm), plan.objects[len(poses) :]
+    if clutter and plan.ground is not None:
+        meshes = [drop.table.mesh, *map(placed_mesh, drop.starts, poses)]
+        table = dataclasses.replace(
+            drop.table, mesh=join_meshes(meshes), top=dataclasses.replace(drop.table.top, convex=False)
+        )
+        called = called_for(clutter, table, physics)
+        ground = dataclasses.replace(plan.ground, table=table)
+        with suppress(SettleError):
+            over = dataclasses.replace(plan, objects=clutter, ground=ground)
+            rest = settle_scene(over, physics, add_effects(effects, called))
+            return Rest(
+                (*drop.starts, *rest.starts), (*kept, *rest.settled), dict.fromkeys(sorted(called), "clutter falls")
+            )
+    return Rest(drop.starts, kept)
 
 
 RECHECK_S = 1.0

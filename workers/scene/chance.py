@@ -35,6 +35,7 @@ class Stream(IntEnum):
     ENVIRONMENT = 22
     SURROUNDINGS = 23
     CLUTTER = 24
+    GIVEN = 27
 
 
 _SENSORS = {"depth_noise": Stream.SENSOR_DEPTH, "rgb_noise": Stream.SENSOR_RGB, "exposure": Stream.SENSOR_EXPOSURE}
