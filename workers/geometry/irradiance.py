@@ -66,10 +66,8 @@ def solid_angles(height: int) -> Array:
 
 
 def reduce_map(radiance: Map, height: int) -> Map:
-    """A map of another height; pixels are means by solid angle where it shrinks, so that no light is lost."""
+    """A map of a smaller height: means by solid angle, so that no light is lost."""
     size = (2 * height, height)
-    if height >= len(radiance):
-        return np.asarray(cv2.resize(radiance, size, interpolation=cv2.INTER_LINEAR), np.float32)
     weight = solid_angles(len(radiance)).astype(np.float32)
     weighed = cv2.resize(radiance * weight[..., None], size, interpolation=cv2.INTER_AREA)
     weights = cv2.resize(weight, (1, height), interpolation=cv2.INTER_AREA)

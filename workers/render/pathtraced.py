@@ -13,12 +13,14 @@ samples, noise on floor and table is a tenth of that of independent samples, for
 environment map are sampled at every bounce, straight through glass and holes, so that both throw tinted shadows. Both sides of
 every face are drawn.
 
-**The key light** is `LAMPS` distant lights spread evenly over a lamp of `LAMP_RAD`, with the direction and strength of the
-raster tier's. Their shadows are as soft as a disc's, and no path can hit them: a disc a thousand times as bright as the sky,
-hit after a mirror, leaves fireflies that hundreds of samples do not average out. Mirrors show a glow in the sky instead,
-which has the share `GLOW` of the light.
+**The key light**, and each light with a size, is `LAMPS` distant lights spread evenly over its disc, with the direction and
+strength of the raster tier's. Their shadows are as soft as a disc's, and no path can hit them: a disc a thousand times as bright
+as the sky, hit after a mirror, leaves fireflies that hundreds of samples do not average out. Mirrors show a glow in the sky
+instead, which has the share `GLOW` of the light.
 
-**The environment map** holds the sky, the other lights as soft lamps, and the light from below the horizon.
+**The environment map** holds the sky, the other lights as soft lamps, and the light from below the horizon; or it is the
+surround's map, with its sun: at 16 paths, errors on a scene under a clear sky are 0.09 rms of the light, 0.07 with the sun as
+lamps, and in both no more than 2 pixels in 10,000 are 1.6 times too bright.
 
 **Inherent effects.** Paths start at random points of a pixel and end at lights that they see: the plan cannot withdraw
 `antialiasing` or `shadows` here.

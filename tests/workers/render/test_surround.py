@@ -8,7 +8,7 @@ import trimesh
 from schemas.base import frozen_array
 from schemas.job.look import BUILT_IN
 from schemas.scene.scene import Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT, Appearance, Light, MapSource, Part, Shape
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE, Appearance, Light, MapSource, Part, Shape
 from tests.workers.render.random_scenes import BLACK, EYE, FLAT, RASTER, camera, matte, paths, small, traced, without
 from workers.assets import environment
 from workers.assets.environment import expose_map, load_map, relight
@@ -138,3 +138,39 @@ def test_a_level_white_surface_is_just_below_what_clips_and_none_is_burnt_out(na
     received = integrated(radiance, normals / np.linalg.norm(normals, axis=1)[:, None]) @ LUMINANCE
     assert 0.3 < received[0] < 0.97 and received.max() < 2.05
     assert received[0] > 0.93 or received.max() > 1.95
+
+
+def on_a_table(renderer, elevation_deg, size_deg):
+    """(linear light, x) of the pixels [H, W] of a table top with a box on it, seen from above; the light comes from +x."""
+    slab, box = trimesh.creation.box((1.6, 1.6, 0.1)), trimesh.creation.box((0.1, 0.1, 0.1))
+    slab.apply_translation((0.0, 0.0, 0.55))
+    box.apply_translation((0.4, 0.0, 0.65))
+    things = tuple(
+        Placed(
+            region,
+            Shape((Part("x", frozen_array(m.vertices), frozen_array(m.faces, np.int32), matte(0.5)),), True),
+            EYE,
+        )
+        for region, m in ((REGION_TABLE, slab), (REGION_FIRST_OBJECT, box))
+    )
+    e = np.radians(elevation_deg)
+    color = (0.6 / np.sin(e),) * 3
+    light = Light(frozen_array([np.cos(e), 0.0, np.sin(e)]), color, float(np.radians(size_deg)))
+    look = Appearance((0.3,) * 3, (light,), BLACK, (0.2,) * 3)
+    view = camera(small(160, 160), orbit_pose(np.zeros(3), np.pi / 2 - 1e-3, np.pi, 1.3))
+    drawn = renderer.draw(things, look, view, *RASTER)
+    v, u = np.indices(drawn.region.shape) + 0.5
+    points = np.stack([(u - 80.0) / 80.0, (v - 80.0) / 80.0, np.ones(u.shape)], axis=2) * drawn.depth_m[..., None]
+    x = (points @ view.T_world_cam[:3, :3].T + view.T_world_cam[:3, 3])[..., 0]
+    return np.where(drawn.region == REGION_TABLE, decode_codes(drawn.rgb).mean(axis=2), np.nan), x
+
+
+def test_a_low_light_leaves_an_open_table_lit_and_a_wide_lamp_blurs_its_shadows(renderer):
+    """Lambert, and a little that is mirrored, on the side of the light, without stripes; and a shadow's steepest step."""
+    for elevation in (6.0, 12.0, 25.0, 60.0):
+        top, x = on_a_table(renderer, elevation, 1.0)
+        open_side = top[(x > 0.56) & np.isfinite(top)]
+        assert len(open_side) > 500
+        assert open_side == pytest.approx(0.5 * (0.3 + 0.6) + 0.04 * 0.4, rel=0.03)
+    steps = [np.nanmax(np.abs(np.diff(on_a_table(renderer, 35.0, size)[0], axis=0))) for size in (1.0, 8.0, 20.0)]
+    assert steps[0] > 1.25 * steps[1] and steps[1] > 1.1 * steps[2]
