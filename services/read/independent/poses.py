@@ -259,6 +259,9 @@ def _check_lines(
 
 GRAVITY_M_S2 = 9.81
 
+FRICTION, MOST_FRICTION = 0.7, 10.0
+"""Of what a map of coefficients does not name; and that of a contact at most."""
+
 SHARE = 0.01
 """Of a weight, or of a weight at the lever of the farthest contact: what may be without balance."""
 
@@ -269,14 +272,26 @@ def check_forces(job: Mapping[str, Any], scene: Row) -> Iterator[str]:
     falls = job.get("captures") is None and job.get("scene") != "studio"
     if not bodies or not falls or not job["physics"]["exact_rest"]:
         return
-    friction = job["physics"]["friction"] ** 2
+    where, frictions = f"scene {scene['scene_id']}", {TABLE: _friction_of(job, "table")}
     for body in bodies:
-        for fault in _check_body(body, friction):
-            yield f"scene {scene['scene_id']}, region {body['region_id']}: {fault}"
-    yield from (f"scene {scene['scene_id']}: {fault}" for fault in _check_reactions(bodies))
+        expected, stored = _friction_of(job, body["category"]), body.get("friction")
+        frictions[body["region_id"]] = expected if stored is None else stored
+        if stored != (expected if isinstance(job["physics"]["friction"], dict) else None):
+            yield f"{where}, region {body['region_id']}: its friction is {stored}, and physics.friction gives {expected:g}"
+    for body in bodies:
+        others = np.array([frictions.get(contact["with_region"], math.nan) for contact in body["contacts"]])
+        friction = np.minimum(frictions[body["region_id"]] * others, MOST_FRICTION)
+        yield from (f"{where}, region {body['region_id']}: {fault}" for fault in _check_body(body, friction))
+    yield from (f"{where}: {fault}" for fault in _check_reactions(bodies))
 
 
-def _check_body(body: Row, friction: float) -> Iterator[str]:
+def _friction_of(job: Mapping[str, Any], category: str) -> float:
+    """The coefficient of a body of this category, or of the table."""
+    given = job["physics"]["friction"]
+    return float(given.get(category, FRICTION) if isinstance(given, dict) else given)
+
+
+def _check_body(body: Row, friction: Array) -> Iterator[str]:
     contacts = body["contacts"]
     if not contacts:
         yield "nothing holds it"
@@ -295,8 +310,8 @@ def _check_body(body: Row, friction: float) -> Iterator[str]:
     slipping = np.linalg.norm(force - pressed[:, None] * normal, axis=1)
     if (pressed < -ROUNDING * weight).any():
         yield "a contact pulls"
-    if (slipping > friction * pressed + ROUNDING * weight).any():
-        yield f"a contact needs more than its friction of {friction:g}"
+    if not (holds := slipping <= friction * pressed + ROUNDING * weight).all():
+        yield f"a contact needs more than its friction of {friction[~holds].min():g}"
 
 
 def _check_reactions(bodies: list[Row]) -> Iterator[str]:

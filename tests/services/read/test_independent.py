@@ -71,6 +71,7 @@ HEALTHY = {
         "pairs_per_scene": 2,
         "cameras": {"mirror": {"T_z_m": 1.1, "percentile": 0.0}},
     },
+    "frictions": {"physics": {"friction": {"mug": 0.3, "table": 1.2}}, "objects_per_scene": 2},
     "median, tar": {"cameras": {"mirror": {"percentile": 50.0}}, "output": {"layout": "tar"}},
     "no mirror": {"cameras": {"mirror": {"enabled": False}}, "images": {"projection": {"enabled": False}}},
     "no colour": {"cameras": {"depth": {"enabled": False}}, "render": {"rgb": False}},
@@ -436,8 +437,8 @@ LOW_CONTACTS = [contact(2, [x, 0.0, 0.0], [0.0, 0.0, (LOW + HIGH) / 2]) for x in
 LOW_CONTACTS += [contact(4, [x, 0.0, 0.2], [0.0, 0.0, -HIGH / 2], DOWN) for x in (-0.05, 0.05)]
 HIGH_CONTACTS = [contact(3, [x, 0.0, 0.2], [0.0, 0.0, HIGH / 2]) for x in (-0.05, 0.05)]
 BODIES = [
-    {"region_id": 3, "mass_kg": 2.0, "com": [0.0, 0.0, 0.1], "contacts": LOW_CONTACTS},
-    {"region_id": 4, "mass_kg": 1.0, "com": [0.0, 0.0, 0.3], "contacts": HIGH_CONTACTS},
+    {"region_id": 3, "category": "box", "mass_kg": 2.0, "com": [0.0, 0.0, 0.1], "contacts": LOW_CONTACTS},
+    {"region_id": 4, "category": "mug", "mass_kg": 1.0, "com": [0.0, 0.0, 0.3], "contacts": HIGH_CONTACTS},
 ]
 """A body of 1 kg on one of 2 kg, each held at two points."""
 
@@ -479,5 +480,26 @@ def test_forces_of_a_scene_in_balance_have_no_fault_and_each_wrong_one_is_told()
         (lambda low, high: low["contacts"][0].update(normal=[0.0, 0.0, 1.001]), "has not the length 1"),
     ):
         assert told in faults(edit)
+    given = {"box": 2.0, "mug": 0.25}  # the table has 0.7: on it the box has 1.4, under the mug 0.5
+
+    def leaning(box: float | None, mug: float | None, most: float, pushed: int, job: Any = given) -> str:
+        """The mug pushed aside by 0.4 of what presses it, or the box by `most` less a thousandth, both ways."""
+
+        def edit(low, high):
+            low["friction"], high["friction"] = box, mug
+            for k, sign in ((0, 1), (1, -1)):
+                first = (low if pushed == 3 else high)["contacts"]
+                first[k]["force"][0] = sign * (most - 1e-3) * first[k]["force"][2]
+                if pushed == 4:
+                    low["contacts"][k + 2]["force"][0] = -first[k]["force"][0]
+
+        return faults(edit, {"physics": {"friction": job, "exact_rest": True}, "captures": None})
+
+    assert leaning(2.0, 0.25, 1.4, 3) == leaning(2.0, 0.25, 0.5, 4) == ""
+    assert "region 3: a contact needs more than its friction of 1.4" in leaning(2.0, 0.25, 1.402, 3)
+    assert "region 4: a contact needs more than its friction of 0.48" in leaning(2.0, 0.24, 0.5, 4)
+    assert "region 4: its friction is 0.24, and physics.friction gives 0.25" in leaning(2.0, 0.24, 0.4, 4)
+    assert "region 3: its friction is None, and physics.friction gives 2" in leaning(None, 0.25, 0.4, 3)
+    assert "region 3: its friction is 2.0, and physics.friction gives 0.7" in leaning(2.0, None, 0.4, 3, 0.7)
     without_rest = {"physics": {"friction": 0.7, "exact_rest": False}, "captures": None}
     assert faults(nothing_below, without_rest) == faults(nothing_below, {**JOB, "captures": {}}) == ""
