@@ -54,6 +54,7 @@ AROUND = (
     | {name: {"preset": name} for name in ("zero123", "zero123plus", "lrm", "trellis")}
     | {"everywhere": {"sphere": {"count": 4, "pattern": "fibonacci"}}}
 )
+SMALL_SENSOR = {"width": 64, "height": 48, "fx": 52.5, "fy": 52.5, "cx": 32.0, "cy": 24.0}
 SCENES = [2, pytest.param(100, marks=pytest.mark.slow)]
 
 
@@ -74,9 +75,8 @@ def test_every_view_of_every_kind_shows_what_rays_meet_and_verifies(tmp_path, sc
     more = [
         entry | {"name": f"cam-{kind}"} | ({"poses": poses} if kind == "poses" else {}) for kind, entry in kinds.items()
     ]
-    sensor = {"width": 64, "height": 48, "fx": 52.5, "fy": 52.5, "cx": 32.0, "cy": 24.0}
     job = {"scene": scene, "scenes": scenes, "check": {"raycast_share": 1.0}, "images": {"depth_range_m": [0.05, 13.0]}}
-    store, _ = make_dataset(tmp_path / "out", **job, cameras={"more": more, "sensor": sensor})
+    store, _ = make_dataset(tmp_path / "out", **job, cameras={"more": more, "sensor": SMALL_SENSOR})
     stored = [find_scene(store, scene_id) for scene_id in range(scenes)]
     assert not [row for each in stored for row in each.rows["failures"]]
     assert all(row["raycast_checked"] for each in stored for row in each.rows["scenes"])
@@ -303,6 +303,26 @@ def test_a_camera_that_cannot_stand_there_makes_a_failure_that_names_it(name):
     entry, job, told = NO_VIEW[name]
     with pytest.raises(ViewError, match=told):
         make(Setting({**job, "cameras": {"more": [{"name": "a", **entry}]}}))
+
+
+@pytest.mark.parametrize(("preset", "side_m", "exact"), [("syncdreamer", 0.3, True), ("trellis", 0.1, False)])
+def test_a_preset_so_near_to_a_small_metric_object_that_it_has_no_depth_is_a_failure_with_both_remedies(
+    preset, side_m, exact
+):
+    """Sixteen views at 30 degrees of a cube: at yaw 45 its corner is (root 1.5 + 0.5) / 2 of its side before the middle."""
+    cube, more = box(side_m, side_m, side_m), [{"name": "a", "preset": preset}]
+
+    def tried(low_m: float) -> None:
+        images, studio = {"depth_range_m": [low_m, 5.0]}, {"scale": "metric"}
+        make(alone(cube, cameras={"more": more, "sensor": SMALL_SENSOR}, images=images, studio=studio))
+
+    nearest_m = side_m * (1.5 - (math.sqrt(1.5) + 0.5) / 2.0) if exact else 0.2
+    if exact:
+        tried(nearest_m - 1e-6)
+    with pytest.raises(
+        ViewError, match=r"camera a, number \d+, has .* images.depth_range_m, .* studio.scale: unit_sphere"
+    ):
+        tried(nearest_m + 1e-6)
 
 
 def test_views_that_miss_the_object_say_so_and_fit_keeps_small_and_flat_things_in_range(tmp_path):
