@@ -23,9 +23,10 @@ from schemas.scene.shape import Shape
 from schemas.scene.view import MODALITIES, Camera, View
 from services.job.record import read_success, require_job
 from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, committed_reader, file_reader, find_scene
+from services.read.independent.cameras import read_stands
 from services.read.independent.derive import Kind, StoredPair
 from services.read.independent.poses import check_forces, check_merged, check_pair, list_underived
-from services.read.replay import compare_files, compare_rows, is_same_stack, open_context
+from services.read.replay import compare_files, compare_rows, is_same_stack, open_context, open_unchanged
 from workers.geometry.camera import NEAR_M, project
 from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import edge_distance_px
@@ -209,7 +210,9 @@ def verify_independently(
     """Derive the labels of `count` scenes a second time. Raises OutputError where the folder is no dataset."""
     record = require_job(store)
     job = record.job.model_dump(mode="json")
-    verdict, kinds = IndependentVerdict(underived=list_underived(job)), stored_kinds(record.job)
+    sources = open_unchanged(record) if any(entry.poses for entry in record.job.cameras.more) else None
+    tables = {name: file.path for name, file in sources.poses.items()} if sources else {}
+    verdict, kinds = IndependentVerdict(underived=list_underived(job, tables)), stored_kinds(record.job)
     views: list[Row] = []
     objects: list[Row] = []
     for scene_id in choose_scenes(store, count, record.job.seed):
@@ -219,11 +222,13 @@ def verify_independently(
         assert scene is not None
         verdict.faults += check_forces(job, scene)
 
+        stands = {name: read_stands(path, scene_id) for name, path in tables.items()}
+
         def read(path: str, images: ReadFile = images) -> bytes:
             return store.read(path) if is_shape(path) else images(path)
 
         for pair_views, pair_objects in stored.pairs(scene_id):
-            pair = StoredPair(job, scene, pair_views, pair_objects, read, kinds)
+            pair = StoredPair(job, scene, pair_views, pair_objects, read, kinds, stands=stands)
             try:
                 verdict.faults += check_pair(pair)
             except CorruptError as error:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.read.independent.cameras import sensor_of
+from services.read.independent.cameras import Stand, sensor_of
 from services.read.independent.rays import Array, Faces, Row, bare_faces, place_shapes, read_shape
 
 ROUNDING = 1e-9
@@ -87,6 +87,9 @@ class StoredPair:
     absent: list[str] = field(default_factory=list)
     """Why targets were not judged: shapes that are not stored."""
 
+    stands: Mapping[str, Sequence[Stand]] = field(default_factory=dict)
+    """Rows of tables of poses that are at hand, by camera."""
+
     @property
     def is_captured(self) -> bool:
         """Whether the input view is a photograph: it stands where it was taken, by a camera of its own."""
@@ -107,12 +110,15 @@ class StoredPair:
         return {row["region_id"]: row for row in self.objects if name_of(row) == name_of(view)}
 
     def sensor(self, view: Row) -> Mapping[str, Any]:
-        """The pinhole camera of a view: the job's, of captures the photograph's; nothing where a table of poses may say it."""
+        """The pinhole camera of a view: the job's, of captures the photograph's; nothing where a table not at hand may say it."""
         sensor: Mapping[str, Any] = self.job["cameras"]["sensor"]
         if self.is_captured:
             return {name: self.views["input"][name] for name in sensor}
         entry = self.named.get(view["role"])
-        return sensor if entry is None else sensor_of(entry, sensor)
+        if entry is None or not entry["poses"]:
+            return sensor if entry is None else sensor_of(entry, sensor)
+        row = self.stands.get(entry["name"], ())[view["number"] : view["number"] + 1]
+        return (row[0].pinhole or sensor_of(entry, sensor)) if row else {}
 
     @property
     def targets(self) -> Mapping[str, Any]:

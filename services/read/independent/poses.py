@@ -6,7 +6,7 @@ imports nothing else of the project: rows come as dictionaries, files as bytes. 
 
 import math
 import urllib.parse
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -94,17 +94,24 @@ def check_poses(pair: StoredPair) -> Iterator[str]:
 
 
 def check_named(pair: StoredPair) -> Iterator[str]:
-    """The cameras that a job names: how many a scene's first pair has, and where they stand, but for those of a table."""
+    """The cameras that a job names: how many a scene's first pair has, and where they stand; of a table where it is at hand."""
     is_first = pair.views["input"]["pose_id"] == 2 * pair.job["pairs_per_scene"] * pair.scene["scene_id"]
     subject = None
     for name, entry in pair.named.items():
         views = sorted((view for view in pair.views.values() if view["role"] == name), key=lambda view: view["number"])
         standing = is_first and not entry["beside"]
-        count = len(views) if entry["poses"] else sum(orbit["count"] for orbit in orbits_of(entry)) if standing else 0
-        count = 1 if entry["beside"] else count
+        count = sum(orbit["count"] for orbit in orbits_of(entry)) if standing else int(bool(entry["beside"]))
+        if standing and entry["poses"]:
+            count = len(pair.stands.get(name, views))
         if [view["number"] for view in views] != list(range(count)) or bool(views) != (standing or count == 1):
             yield f"has {len(views)} views of camera {name}, and must have {count}, numbered from 0"
-        elif standing and not entry["poses"]:
+        elif standing and entry["poses"]:
+            T_world_obj = matrix(pair.bodies[0], "T_world_obj")
+            for view, stand in zip(views, pair.stands.get(name, ()), strict=False):
+                T = T_world_obj @ stand.T if stand.of_object else stand.T
+                if not (off := distance(matrix(view, "T_world_cam"), T)) <= ROUNDING:
+                    yield f"T_world_cam of {name_of(view)} is off by {off:.3g} from its row in {entry['poses']}"
+        elif standing:
             try:
                 subject = subject or _subject(pair)
             except FileNotFoundError as error:
@@ -162,8 +169,8 @@ _CAMERA_COLUMNS = (
 )
 
 
-def list_underived(job: Mapping[str, Any]) -> list[str]:
-    """Stored values that have no second derivation for this job, a sentence each."""
+def list_underived(job: Mapping[str, Any], at_hand: Collection[str]) -> list[str]:
+    """Stored values that have no second derivation for this job, a sentence each; at_hand: cameras whose tables are."""
     lines = ["visible_fraction, mirror_agreement and projected_hidden_share are not derived"]
     sensor, projection = job["sensor"], job["images"]["projection"]
     if job.get("captures") is not None:
@@ -174,8 +181,11 @@ def list_underived(job: Mapping[str, Any]) -> list[str]:
         lines.append("projected images are not derived: images.projection.splat or hidden_point_removal is on")
     elif projection["enabled"] and sensor["distortion"]:
         lines.append("colours of projected images are not derived: sensor.distortion is on")
-    if tables := [entry["name"] for entry in job["cameras"]["more"] if entry["poses"]]:
-        lines.append(f"poses of {', '.join(tables)} are not derived: a table of poses has them")
+    lines += [
+        f"poses of {entry['name']} are not derived: {entry['poses']} is not here, or not what it was when the job was run"
+        for entry in job["cameras"]["more"]
+        if entry["poses"] and entry["name"] not in at_hand
+    ]
     if sensor["depth_noise"]:
         lines.append("depth is not compared with the floor's plane: sensor.depth_noise is on")
     if views := job.get("targets", {}).get("views"):

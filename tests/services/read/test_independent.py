@@ -2,14 +2,19 @@
 
 import copy
 import dataclasses
+import json
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import services.merge.tables as tables
+import workers.assets.poses as poses
 import workers.geometry.camera as camera
 import workers.geometry.pixels as pixels
 import workers.geometry.projection as projection
@@ -24,6 +29,7 @@ from services.read.independent.poses import check_forces
 from tests.captures import CAMERA, captures_job, exact_capture, use_exact_captures
 from tests.datasets import faults_of, make_dataset, overlaid, run_here
 from workers.capture import make_capture, rows
+from workers.geometry.camera import look_at
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.render.raster.gbuffer import shared_renderer
 from workers.shard.fingerprint import take_fingerprint
@@ -254,6 +260,51 @@ def only_named(f: Callable, **changes: Callable) -> Callable:
 
 def no_alpha_inside(rgb, region, alpha):
     return np.dstack([rgb, np.where(alpha == 255, 0, alpha)])
+
+
+def tables_of_poses(folder: Path) -> list[dict[str, Any]]:
+    """A camera of each form of table: rounded to five digits, of an object, with pinholes, scenes between one another."""
+    stands = [
+        look_at(np.array([x, 0.7, z]), np.zeros(3)) for x, z in ((0.4, 0.5), (-0.3, 0.9), (0.1, 1.0), (-0.6, 0.4))
+    ]
+    rows = [
+        {"scene_id": n % 2, "T_obj_cam": np.round(T, 5).ravel().tolist(), "more": "x"} for n, T in enumerate(stands)
+    ]
+    pinhole = {"width": 90, "height": 70, "fx": 80.5, "fy": 81, "cx": 45, "cy": 33.5}
+    pq.write_table(pa.Table.from_pylist(rows), folder / "object.parquet")
+    world = look_at(np.array([0.1, 0.8, 1.7]), np.array([0.0, 0.0, 0.8]))
+    (folder / "world.json").write_text(json.dumps([{"T_world_cam": world.tolist(), **pinhole}]))
+    elements = [f"T{i}{j}" for i in range(4) for j in range(4)]
+    (folder / "list.csv").write_text("\n".join(",".join(map(str, line)) for line in (elements, world.ravel())))
+    return [
+        {"name": name.partition(".")[0], "poses": str(folder / name)}
+        for name in ("object.parquet", "world.json", "list.csv")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda stands: stands, ""),
+        (lambda stands: stands[::-1], "T_world_cam of object_000 is off by"),
+        (
+            lambda stands: [(T @ translation(0.0, 0.0, 1e-6), k) for T, k in stands],
+            "T_world_cam of list_000 is off by ",
+        ),
+        (lambda stands: [(T, None) for T, _ in stands], "(world_000): width is 160, the job gives 90"),
+        (lambda stands: stands[:1], "has 1 views of camera object, and must have 2"),
+    ],
+)
+def test_poses_of_a_table_are_derived_from_the_file_at_hand(tmp_path, monkeypatch, wrong, message):
+    more, of_scene = tables_of_poses(tmp_path), poses.Poses.of_scene
+    monkeypatch.setattr(poses.Poses, "of_scene", lambda self, scene_id: iter(wrong(list(of_scene(self, scene_id)))))
+    store, _ = make_dataset(tmp_path / "out", cameras={"more": more})
+    found = verify_independently(store, 2, lambda _: None)
+    assert any(message in fault for fault in found.faults) if message else found.faults == []
+    assert not any("poses of" in line for line in found.underived)
+    (tmp_path / "list.csv").write_text((tmp_path / "list.csv").read_text() + " ")
+    lines = verify_independently(store, 2, lambda _: None).underived
+    assert any("list.csv is not here, or not what it was" in line for line in lines)
 
 
 WRONG_NAMED: dict[str, tuple[object, str, Callable[[Any], object], dict[str, Any], str]] = {
