@@ -88,6 +88,8 @@ class Orbit(Frozen):
     """Offset of the point looked at along x, y and z, each drawn."""
     roll_deg: OneOrRange = Range(0.0, 0.0)
     """Turn of the camera about its optical axis."""
+    always: bool = False
+    """Whether input cameras stand on the orbit also where `scenes_from` has cameras."""
 
     @property
     def share(self) -> float | None:

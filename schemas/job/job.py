@@ -3,7 +3,7 @@
 Every key but `name` has a default, and an unknown key is an error. A digest is that of the keys that differ from their defaults:
 a key that a later version adds leaves the digests of older jobs as they are, and a default that changes makes another dataset
 of an older job, so it is a new version of that key. The path of a folder of assets or of captures is never part of a digest: the
-catalogue's digest covers the files.
+catalogue's digest covers the files. So it is with tables of poses and of scenes.
 """
 
 import hashlib
@@ -15,10 +15,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, Field, field_validator, model_validator
 
-from schemas.base import Frozen, NonNegativeInt, Positive, PositiveInt, Seed, Share, Weight, with_defaults
+from schemas.base import Folder, Frozen, NonNegativeInt, Positive, PositiveInt, Seed, Share, Weight, with_defaults
 from schemas.job.assets import CATEGORIES, TABLE, Assets, CategoryName, describe_unknown, offered_by, with_categories
 from schemas.job.cameras import Cameras
 from schemas.job.captures import Captures, with_capture_keys
+from schemas.job.look import Look
 from schemas.job.physics import ONE_OBJECT, ObjectCount, Physics, Start
 from schemas.job.views import Images, Render, SensorEffects, Studio, Targets
 
@@ -33,6 +34,8 @@ class Check(Frozen):
     """Share of scenes whose depth and masks are compared with a ray caster, and whose objects are let go again."""
     mirror_agreement_mm: Positive = 1.0
     """Largest median difference of input depth carried into the mirror view from mirror depth."""
+    overlap_mm: Positive = 1.0
+    """Deepest that bodies may lie in one another where `scenes_from` puts them: beyond it the scene fails."""
 
 
 class Output(Frozen):
@@ -183,6 +186,9 @@ class Job(Frozen):
     """Id of the first scene."""
     pairs_per_scene: Annotated[int, Field(ge=1, le=1000)] = 1
     """Pairs of each scene, or views of a capture that are stored at most (default 64)."""
+    scenes_from: Folder | None = None
+    """Scenes in place of drawn ones: a table (.csv, .parquet or .json) of objects and cameras, the folder of a finished dataset,
+    or of a scene in the BOP layout (docs/scenes.md)."""
     objects_per_scene: ObjectCount = ONE_OBJECT
     """Objects on the table; a range is drawn from evenly. The first gives the scene's category."""
     categories: dict[CategoryName, Weight] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
@@ -203,6 +209,8 @@ class Job(Frozen):
     """Encodings, patches and projection."""
     render: Render = Render()
     """How RGB is made."""
+    look: Look = Look()
+    """Light and surroundings."""
     sensor: SensorEffects = SensorEffects()
     """Effects of real sensors on exact images; none by default."""
     targets: Targets = Targets()
@@ -306,6 +314,8 @@ class Job(Frozen):
 
 def _unfit_for_scene(job: Job) -> str | None:
     """The key that the job's kind of scene cannot have, with the remedy; None where all fit."""
+    if job.scenes_from is not None and job.scene != "tabletop":
+        return f"scene is {job.scene}, and scenes_from puts objects on a table: leave one of them out"
     if job.scene == "tabletop":
         if job.start.pose == "as_given":
             return "start.pose is as_given, and on a table an object may not rest so: use upright, tumbled or placed"
@@ -339,6 +349,8 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
         return f"captures.simulate.views is {captures.simulate.views}, and pairs_per_scene is {job.pairs_per_scene}: raise that"
     if job.scene != "tabletop":
         return f"scene is {job.scene}: leave it out, a capture's object lies on its board"
+    if job.scenes_from is not None:
+        return "scenes_from has scenes, and captures are asked for: leave one of them out"
     if job.cameras.more:
         return "cameras.more names cameras: leave it out, a capture has the views that were taken"
     if job.cameras.depth.enabled:
@@ -355,7 +367,9 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
     return None if job.render.rgb else "render.rgb is false: a capture has colour, leave it out"
 
 
-PATHS = frozenset({"assets.objects.folder", "assets.tables.folder", "captures.folders", "cameras.more.poses"})
+PATHS = frozenset(
+    {"assets.objects.folder", "assets.tables.folder", "captures.folders", "cameras.more.poses", "scenes_from"}
+)
 """Keys that name places, where the same files may lie elsewhere."""
 
 NOT_OF_A_DATASET = PATHS | {"scenes", "run", "preset"}

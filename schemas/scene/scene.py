@@ -101,6 +101,10 @@ class ScenePlan:
     appearance: Appearance
     more: tuple[NamedCamera, ...] = ()
     """Further cameras that stand by themselves; known where the objects rest."""
+    kept: bool = False
+    """Whether the objects stay where a table of scenes has them, at rest or not."""
+    aimed: bool = False
+    """Whether a table of scenes has the input cameras."""
 
     @property
     def table(self) -> Table:
@@ -119,9 +123,9 @@ class ScenePlan:
         return self.ground
 
 
-SupportedBy = Literal["flat_top", "mesh", "placed", "nothing"]
-"""The support of a drop: the table's flat top alone, its whole mesh, or none where the object was set down at rest; nothing
-in a studio scene."""
+SupportedBy = Literal["flat_top", "mesh", "placed", "kept", "nothing"]
+"""The support of a drop: the table's flat top alone, its whole mesh, or none where the object was set down at rest or is kept
+where a table of scenes has it; nothing in a studio scene."""
 
 
 @dataclass(frozen=True, eq=False)

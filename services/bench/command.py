@@ -82,6 +82,7 @@ def refuse_unmatched(job: Job) -> None:
         "targets.views: []": alone or not job.targets.views,
         "targets.views: [normals]": not alone or set(job.targets.views) <= {"normals"},
         "render.rgb: true": job.render.rgb,
+        "scenes_from: null": job.scenes_from is None,
     }
     if missing := [setting for setting, holds in fits.items() if not holds]:
         raise InputError(f"the benchmark compares whole pairs of one object in files: set {', '.join(missing)}")

@@ -27,6 +27,7 @@ from services.read.independent.cameras import read_stands
 from services.read.independent.derive import Kind, StoredPair
 from services.read.independent.poses import check_forces, check_merged, check_pair, list_underived
 from services.read.replay import compare_files, compare_rows, is_same_stack, open_context, open_unchanged
+from workers.assets.scene_tables import read_scene
 from workers.geometry.camera import NEAR_M, project
 from workers.geometry.frames import invert, motion_between, transform
 from workers.geometry.raycast import edge_distance_px
@@ -34,7 +35,7 @@ from workers.physics.hold import release_again
 from workers.physics.settle import settle_scene
 from workers.render.raster.gbuffer import Renderer
 from workers.scene.context import WorkerContext
-from workers.scene.effects import EFFECTS, STUDIO, Facts, names_of_kind, plan_effects
+from workers.scene.effects import EFFECTS, UNFORCED, Facts, names_of_kind, plan_effects
 from workers.scene.make_scene import Scene, make_scene
 from workers.scene.rows import record_scene
 from workers.stopwatch import Stopwatch
@@ -210,9 +211,15 @@ def verify_independently(
     """Derive the labels of `count` scenes a second time. Raises OutputError where the folder is no dataset."""
     record = require_job(store)
     job = record.job.model_dump(mode="json")
-    sources = open_unchanged(record) if any(entry.poses for entry in record.job.cameras.more) else None
+    sources = (
+        open_unchanged(record)
+        if record.job.scenes_from or any(entry.poses for entry in record.job.cameras.more)
+        else None
+    )
     tables = {name: file.path for name, file in sources.poses.items()} if sources else {}
     verdict, kinds = IndependentVerdict(underived=list_underived(job, tables)), stored_kinds(record.job)
+    if record.job.scenes_from is not None and sources is None:
+        verdict.underived.append("poses are not compared with scenes_from: it is not here, or not what it was")
     views: list[Row] = []
     objects: list[Row] = []
     for scene_id in choose_scenes(store, count, record.job.seed):
@@ -222,13 +229,16 @@ def verify_independently(
         assert scene is not None
         verdict.faults += check_forces(job, scene)
 
-        stands = {name: read_stands(path, scene_id) for name, path in tables.items()}
+        stands, given = {name: read_stands(path, scene_id) for name, path in tables.items()}, None
+        if sources and sources.scenes is not None:
+            rows = read_scene(sources.scenes, scene_id)
+            given = [(each.instance_id, each.T_world_obj) for each in rows.objects], [T for T, _ in rows.cameras]
 
         def read(path: str, images: ReadFile = images) -> bytes:
             return store.read(path) if is_shape(path) else images(path)
 
         for pair_views, pair_objects in stored.pairs(scene_id):
-            pair = StoredPair(job, scene, pair_views, pair_objects, read, kinds, stands=stands)
+            pair = StoredPair(job, scene, pair_views, pair_objects, read, kinds, given=given, stands=stands)
             try:
                 verdict.faults += check_pair(pair)
             except CorruptError as error:
@@ -310,7 +320,7 @@ def _audit_scene(context: WorkerContext, store: Store, scene_id: int, audited: A
     stored = find_scene(store, scene_id)
     row = stored.scene(scene_id)
     assert row is not None
-    forcible = {one["effect"] for one in row["skipped"] if not one["why"].startswith(STUDIO)}
+    forcible = {one["effect"] for one in row["skipped"] if not one["why"].startswith(UNFORCED)}
     left_out = sorted(forcible & audited.effects.keys())
     for name in left_out:
         audited.effects[name].skipped += 1

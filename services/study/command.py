@@ -145,6 +145,8 @@ def make_plan(asked: Job, options: argparse.Namespace, targets: Targets | None) 
             "scene is studio: nothing falls, rests or casts a shadow, so no error is traded for time: ask for scenes on a "
             "table, or for captures"
         )
+    if asked.scenes_from is not None:
+        raise InputError("scenes_from has scenes, and a study draws its own: leave it out")
     missing = colour_truth_missing()
     refuse_unmeasured(asked, targets or {}, missing)
     if (captures := asked.captures) is None:

@@ -8,7 +8,14 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from schemas.job.views import ViewTarget
-from tests.effects.scenes import ABOVE_THE_HORIZON, Setting, merged, with_holes, without_textures
+from tests.effects.scenes import (
+    ABOVE_THE_HORIZON,
+    Setting,
+    above_the_table,
+    merged,
+    with_holes,
+    without_textures,
+)
 
 TARGETS: tuple[str, ...] = get_args(ViewTarget)
 
@@ -79,9 +86,14 @@ ASKED: dict[str, Case] = {
         {**STUDIO, **FRAMED, "studio": {"background": [0.0, 0.0, 0.0]}},
         "studio.background is a colour",
     ),
+    "kept_poses": _asked(
+        {"scenes_from": above_the_table(settle=False)},
+        {"scenes_from": above_the_table(settle=True)},
+        "settle is true: objects fall from there",
+    ),
 }
 
-OF_OTHERS = {*TARGETS, "further_views", "alpha"}
+OF_OTHERS = {*TARGETS, "further_views", "alpha", "kept_poses"}
 """Effects that the receipt of a job does not name which has nothing of their kind."""
 
 NO_OPS: dict[str, Case] = {

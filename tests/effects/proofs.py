@@ -170,6 +170,7 @@ PROOFS: dict[str, Proof] = {
     ),
     "restitution": Proof(Setting({**TUMBLED, "physics": {"restitution": 0.8}}), same_as(Setting(TUMBLED))),
     "depth_camera": switched("depth_camera"),
+    "kept_poses": Proof(ASKED["kept_poses"].needs, rests),
     "mirror": Proof(Setting({}), same_as(Setting(WITHOUT_MIRROR))),
     "projection": switched("projection"),
     "splat": switched("splat"),

@@ -1,5 +1,7 @@
 """Scenes to try effects on: a job's changes, and what is done to the scene that is drawn."""
 
+import json
+import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -15,6 +17,7 @@ from schemas.scene.scene import Ground, ScenePlan
 from schemas.scene.shape import Part, Shape
 from services.job.job_file import validate_job
 from workers.assets.catalogue import Catalogue, open_catalogue
+from workers.assets.scene_tables import open_scenes
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.chance import SceneChance
 from workers.scene.context import WorkerContext
@@ -84,8 +87,19 @@ def _catalogue(categories: tuple[str, ...]) -> Catalogue:
     return open_catalogue(Job(name="c").assets, Path(), categories)
 
 
+TABLES = tempfile.TemporaryDirectory(prefix="verso-tests-scenes-")
+
+
+def above_the_table(settle: bool) -> str:
+    """A table of scenes with a can that hovers above the middle of the table, or falls from there."""
+    path, T = Path(TABLES.name) / f"{settle}.json", np.eye(4)
+    T[2, 3] = 1.2
+    path.write_text(json.dumps([{"instance_id": "can-0-000003", "T_world_obj": T.tolist(), "settle": settle}]))
+    return str(path)
+
+
 def context_of(job: Job, forced: Iterable[str] = (), withdrawn: Iterable[str] = ()) -> WorkerContext:
-    catalogue = _catalogue(tuple(job.categories))
+    catalogue = replace(_catalogue(tuple(job.categories)), scenes=open_scenes(job, Path()))
     digest = settings_digest(job, catalogue.digest)
     return WorkerContext(job, catalogue, shared_renderer(), digest, frozenset(forced), frozenset(withdrawn))
 

@@ -19,6 +19,7 @@ from schemas.capture import CaptureListing
 from schemas.errors import AssetSourceError, MeshError
 from schemas.job.assets import (
     BUILT_IN,
+    CATEGORIES,
     MOST_TOLD,
     TABLE,
     VERSION,
@@ -75,6 +76,8 @@ class Catalogue:
     """Folders of captures, in order; the digest covers their files too."""
     poses: Mapping[str, PoseFile] = field(default_factory=dict)
     """Tables of camera poses by the name of their camera; the digest covers them too."""
+    scenes: PoseFile | None = None
+    """The table of scenes that the job names; the digest covers it too."""
 
     def offers(self, category: str) -> list[tuple[int, AnySource, int]]:
         """Number, settings and count of instances of every source that has this category."""
@@ -121,6 +124,26 @@ class Catalogue:
         if settings.diagonal_m is not None and category != TABLE:
             name += f"-{1000 * settings.diagonal_m:g}mm".replace(".", "_")
         return InstanceRef(number, category, index, name)
+
+    def find(self, name: str, tables: bool = False) -> InstanceRef | None:
+        """The instance of an object, or of a table, by its id; None where no source has it."""
+        for number, (settings, library) in enumerate(self._sources(TABLE if tables else "")):
+            if isinstance(settings, ProceduralSource):
+                for category in (TABLE,) if tables else CATEGORIES:
+                    kind, _, index = name.rpartition("-")
+                    if kind == f"{settings.named(category)}-{settings.seed}" and index.isdecimal():
+                        ref = self.refer(number, category, int(index))
+                        if ref.instance_id == name and ref.index < settings.instances:
+                            return ref
+            else:
+                assert library is not None
+                places = library.places
+                for each in (name, name.rpartition("-")[0]):
+                    if each in places and (places[each][0] == TABLE) == tables:
+                        ref = self.refer(number, *places[each])
+                        if ref.instance_id == name:
+                            return ref
+        return None
 
     def libraries(self) -> "list[Library]":
         """Those of all sources, each once."""

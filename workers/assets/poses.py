@@ -7,7 +7,8 @@ height. Other columns are ignored. Frames are the dataset's own: camera to world
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -47,7 +48,7 @@ TOLERANCE = 1e-4
 
 @dataclass(frozen=True)
 class PoseFile:
-    """A table of poses: where it is, and the SHA-256 of its bytes."""
+    """A table of poses, or of scenes (scene_tables.py): where it is, and the SHA-256 of its bytes, or of its files'."""
 
     path: Path
     sha256: str
@@ -87,41 +88,51 @@ def open_poses(job: Job, folder: Path) -> Mapping[str, PoseFile]:
         if entry.poses is None:
             continue
         path = (folder / Path(entry.poses).expanduser()).resolve()
-        try:
+        with naming(f"cameras.more.{number}.poses: {path}"):
             if path.exists() and not path.is_file():
                 raise ValueError("is no file")
-            with open(path, "rb") as file:
-                opened[entry.name] = PoseFile(path, hashlib.file_digest(file, "sha256").hexdigest())
-            _require_scenes(read_poses(opened[entry.name]), job)
-        except OSError as error:
-            raise AssetSourceError(
-                f"cameras.more.{number}.poses: {path} cannot be read: {error.strerror or error}"
-            ) from error
-        except (ValueError, KeyError, RecursionError, pa.ArrowException) as error:
-            raise AssetSourceError(f"cameras.more.{number}.poses: {path}: {plain_line(str(error), 300)}") from error
+            opened[entry.name] = PoseFile(path, digest_file(path))
+            poses = read_poses(opened[entry.name])
+            require_scenes(poses.scene_ids, len(poses.T), job, MOST_VIEWS, "add theirs")
     return opened
 
 
-def _require_scenes(poses: Poses, job: Job) -> None:
-    """Raises ValueError where a scene of the job has no row, or more views than there may be."""
-    if poses.scene_ids is None:
-        count, scene = len(poses.T), "every scene"
-    else:
-        ids, counts = np.unique(poses.scene_ids, return_counts=True)
+@contextmanager
+def naming(what: str) -> Iterator[None]:
+    """Raises AssetSourceError, naming the key and the file, for what reading a table raises."""
+    try:
+        yield
+    except OSError as error:
+        raise AssetSourceError(f"{what} cannot be read: {error.strerror or error}") from error
+    except (ValueError, KeyError, RecursionError, pa.ArrowException) as error:
+        words = str(error).rpartition("Invalid: ")[2]  # Arrow says first in which calls it was
+        raise AssetSourceError(f"{what}: {plain_line(words, 300)}") from error
+
+
+def digest_file(path: Path) -> str:
+    """SHA-256, hex, of a file."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def require_scenes(ids: np.ndarray | None, rows: int, job: Job, most: int, remedy: str) -> None:
+    """Raises ValueError where a scene of the job has no row, or more than `most`. ids [N]: a row each, None: all have all."""
+    count, scene = rows, "every scene"
+    if ids is not None:
+        there, counts = np.unique(ids, return_counts=True)
         wanted = np.arange(job.first_scene, job.stop_scene)
-        if len(lacking := np.setdiff1d(wanted, ids)):
-            raise ValueError(
-                f"{len(lacking)} of {len(wanted)} scenes have no row, the first is {lacking[0]}: add theirs"
-            )
-        count, scene = int(counts.max()), f"scene {ids[counts.argmax()]}"
-    if not 0 < count <= MOST_VIEWS:
-        raise ValueError(f"{scene} has {count} rows, and must have 1 to {MOST_VIEWS}: split them by scene_id")
+        if len(lacking := np.setdiff1d(wanted, there)):
+            lack = f"{len(lacking)} of {len(wanted)} scenes have no row, the first is {lacking[0]}"
+            raise ValueError(f"{lack}: {remedy.format(f'{there[0]} to {there[-1]}' if len(there) else 'none')}")
+        count, scene = int(counts.max()), f"scene {there[counts.argmax()]}"
+    if not 0 < count <= most:
+        raise ValueError(f"{scene} has {count} rows, and must have 1 to {most}: split them by scene_id")
 
 
 @lru_cache(maxsize=8)
 def read_poses(file: PoseFile) -> Poses:
     """The rows of a table. Raises ValueError where they are none, OSError where it cannot be read."""
-    table = _read_table(file.path)
+    table = open_table(file.path).read_all()
     names = table.column_names
     if not len(table):
         raise ValueError("has no rows")
@@ -142,23 +153,56 @@ def read_poses(file: PoseFile) -> Poses:
     pinholes = np.stack([_numbers(table, name, *BOUNDS[name]) for name in PINHOLE], axis=1) if there else None
     scene_ids = _numbers(table, "scene_id", 0, 2**53, True).astype(np.int64) if "scene_id" in names else None
     for start in range(0, len(T), BLOCK):
-        T[start : start + BLOCK] = _rigid(T[start : start + BLOCK], start)
+        T[start : start + BLOCK] = rigid(T[start : start + BLOCK], start)
     return Poses(T, frames == ["T_obj_cam"], scene_ids, pinholes)
 
 
-def _read_table(path: Path) -> pa.Table:
-    """The table in a file, by the end of its name."""
+MOST_JSON = 32 * 2**20
+"""Bytes of a table in JSON, which is read whole; the others are read in pieces."""
+
+_FLOATS, _TEXTS = (*ELEMENTS, *PINHOLE), ("instance_id", "category", "table_id", "T_world_obj", *FRAMES)
+_CSV_TYPES = {**dict.fromkeys(_FLOATS, pa.float64()), **dict.fromkeys(_TEXTS, pa.string()), "settle": pa.bool_()}
+"""Of columns whose first rows may look otherwise: as whole numbers, or empty."""
+
+
+def open_table(path: Path, columns: Collection[str] = (), near: range | None = None) -> pa.RecordBatchReader:
+    """The rows of a file, by the end of its name, some thousands at a time; a JSON file is read whole.
+
+    Of a Parquet file these columns alone, where there are any, and without groups of rows that have no `scene_id` near. Raises
+    ValueError, OSError, ArrowException.
+    """
     kind = path.suffix.lower()
     if kind == ".csv":
-        return pa.csv.read_csv(path)
+        return pa.csv.open_csv(path, convert_options=pa.csv.ConvertOptions(column_types=_CSV_TYPES))
     if kind == ".parquet":
-        return pa.parquet.read_table(path)
+        file = pa.parquet.ParquetFile(path, buffer_size=2**20, pre_buffer=False)
+        names = [name for name in file.schema_arrow.names if name in columns or not columns]
+        groups = [n for n in range(file.num_row_groups) if near is None or _may_hold(file.metadata.row_group(n), near)]
+        batches = file.iter_batches(BATCH, groups, names, use_threads=False)
+        return pa.RecordBatchReader.from_batches(pa.schema([file.schema_arrow.field(name) for name in names]), batches)
     if kind == ".json":
+        if (size := path.stat().st_size) > MOST_JSON:
+            raise ValueError(
+                f"has {size / 2**20:.0f} MiB, and at most {MOST_JSON >> 20} are read of JSON: write .parquet"
+            )
         rows: Any = json.loads(path.read_bytes())
         if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
             raise ValueError("is no list of rows: write [{...}, {...}]")
-        return pa.Table.from_pylist(rows)
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        return pa.table({name: [row.get(name) for row in rows] for name in names}).to_reader()
     raise ValueError(f"its name ends in {kind or 'nothing'}: .csv, .parquet and .json are read")
+
+
+BATCH = 8192
+"""Rows that are read of a Parquet file at once."""
+
+
+def _may_hold(group: Any, near: range) -> bool:
+    """Whether a group of rows may have a scene of these, by its statistics."""
+    for column in (group.column(n) for n in range(group.num_columns)):
+        if column.path_in_schema == "scene_id" and column.statistics is not None and column.statistics.has_min_max:
+            return bool(column.statistics.min < near.stop and column.statistics.max >= near.start)
+    return True
 
 
 def _numbers(table: pa.Table, name: str, least: float = -np.inf, most: float = np.inf, whole: bool = False) -> Array:
@@ -186,16 +230,20 @@ def _matrices(column: pa.ChunkedArray, name: str) -> Array:
             return np.array(values.flatten().cast(pa.float64()).to_numpy(zero_copy_only=False)).reshape(-1, 4, 4)
     T = np.empty((len(values), 4, 4))
     for number, row in enumerate(values):
-        try:
-            T[number] = np.reshape(json.loads(row.as_py()) if pa.types.is_string(row.type) else row.as_py(), (4, 4))
-        except (TypeError, ValueError) as error:
-            given = plain_line(str(row.as_py()), 100)
-            raise ValueError(f"row {number}: {name} is {given}, and must be sixteen numbers") from error
+        T[number] = matrix_of(row.as_py(), f"row {number}: {name}")
     return T
 
 
-def _rigid(T: Array, start: int) -> Array:
-    """Poses [N, 4, 4] with the nearest rotations; `start`: the first one's row.
+def matrix_of(value: Any, where: str) -> Array:
+    """[4, 4] float64 of sixteen numbers, of four lists of four, or of such lists as text. Raises ValueError."""
+    try:
+        return np.reshape(json.loads(value) if isinstance(value, str) else value, (4, 4)).astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{where} is {plain_line(str(value), 100)}, and must be sixteen numbers") from error
+
+
+def rigid(T: Array, start: int | None = None) -> Array:
+    """Poses [N, 4, 4] with the nearest rotations, those as they are that are rotations to 1e-12; `start`: the first one's row.
 
     Raises ValueError where one is no rigid transform, with the row and the figure.
     """
@@ -211,7 +259,8 @@ def _rigid(T: Array, start: int) -> Array:
     for what, wrong in faults.items():
         if wrong.any():
             row = int(np.argmax(wrong))
-            raise ValueError(f"row {start + row}: the pose {what}: {np.round(T[row], 4).tolist()}")
+            where = "" if start is None else f"row {start + row}: "
+            raise ValueError(f"{where}the pose {what}: {np.round(T[row], 4).tolist()}")
     u, _, v = np.linalg.svd(R)
     rigid = T.copy()
     rigid[:, :3, :3] = np.where(off[:, None, None] > 1e-12, u @ v, R)

@@ -25,6 +25,7 @@ from schemas.errors import AssetSourceError, CaptureError, InputError, command_l
 from schemas.job.job import Job
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
 from workers.assets.poses import open_poses
+from workers.assets.scene_tables import open_scenes
 from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW
 from workers.capture.truth import TRUTH
 from workers.door.meshes.ply import Element, encode_ply, parse_ply
@@ -165,9 +166,11 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
     `watch` is told now and then how far it is. Raises AssetSourceError that names the key of a folder that cannot be used.
     """
     catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories), watch)
-    if poses := open_poses(job, job_folder):
-        whole = "\n".join([catalogue.digest, *(file.sha256 for file in poses.values())])
-        catalogue = replace(catalogue, poses=poses, digest=hashlib.sha256(whole.encode()).hexdigest())
+    poses, scenes = open_poses(job, job_folder), open_scenes(job, job_folder)
+    if read := [*poses.values(), *([] if scenes is None else [scenes])]:
+        whole = "\n".join([catalogue.digest, *(file.sha256 for file in read)])
+        digest = hashlib.sha256(whole.encode()).hexdigest()
+        catalogue = replace(catalogue, poses=poses, scenes=scenes, digest=digest)
     if job.captures is None or not job.captures.folders:
         return catalogue
     listings, folders = [], job.captures.folders

@@ -1,7 +1,8 @@
 """How a drop ends: what is measured of objects at rest, and why those are refused that do not rest."""
 
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,10 +13,18 @@ from schemas.job.physics import Physics
 from schemas.scene.scene import ObjectStart, Settled, SupportedBy
 from workers.geometry.frames import transform
 from workers.physics.fall import Outcome
-from workers.physics.placement import TOUCHING_M, Placement, Support, measure_supports
+from workers.physics.placement import (
+    FARTHEST_M,
+    TOUCHING_M,
+    Placement,
+    Support,
+    find_gaps_m,
+    measure_supports,
+    placed_mesh,
+)
 from workers.physics.pour import LostError, moved_to, points_of
 from workers.physics.release import LEFT_M, Drop
-from workers.physics.support import inside_margin
+from workers.physics.support import inside_margin, vertical_gap
 
 UNBALANCED = 1e-3
 """Share of the weight, and of weight times size, that the contacts of what rests may leave unbalanced."""
@@ -124,21 +133,53 @@ def describe(ending: Ending) -> tuple[Settled, ...]:
         for number, held in enumerate(supports):
             _require_support(ending, number, held)
     support = _support_of(ending)
-    return tuple(
-        Settled(
-            T_world_obj=frozen_array(T),
-            penetration_mm=max(0.0, -held.gap_m) * 1e3,
-            hover_gap_mm=max(0.0, held.gap_m) * 1e3,
-            support_margin_mm=held.margin_m * 1e3,
-            equilibrium_residual=held.unbalanced,
-            residual_speed_mm_s=ending.speed_m_s * 1e3,
-            settle_s=ending.seconds,
-            support=support,
-            contacts=held.forces,
-            spun=ending.spun,
-        )
-        for T, held in zip(ending.poses, supports, strict=True)
+    return tuple(_settled(ending, T, held, support) for T, held in zip(ending.poses, supports, strict=True))
+
+
+def _settled(ending: Ending, T_world_obj: Pose, held: Support, support: SupportedBy) -> Settled:
+    return Settled(
+        T_world_obj=frozen_array(T_world_obj),
+        penetration_mm=max(0.0, -held.gap_m) * 1e3,
+        hover_gap_mm=max(0.0, held.gap_m) * 1e3,
+        support_margin_mm=held.margin_m * 1e3,
+        equilibrium_residual=held.unbalanced,
+        residual_speed_mm_s=ending.speed_m_s * 1e3,
+        settle_s=ending.seconds,
+        support=support,
+        contacts=held.forces,
+        spun=ending.spun,
     )
+
+
+def describe_kept(ending: Ending, most_mm: float) -> tuple[Settled, ...]:
+    """The figures of objects at poses that nothing led to, also where they hover.
+
+    An overlap is that with others, the table or the floor. A gap of `FARTHEST_M` or more is that below the object, straight
+    down. Raises SettleError where objects overlap by more than `most_mm`.
+    """
+    drop, kept = ending.drop, list[Settled]()
+    meshes = [*(placed_mesh(start, T) for start, T in zip(drop.starts, ending.poses, strict=True)), drop.table.mesh]
+    for number, held in enumerate(measure_supports(ending.placement, ending.poses)):
+        lowest_m = float(meshes[number].vertices[:, 2].min())
+        gap_m = min(held.gap_m, lowest_m)
+        if held.gap_m >= FARTHEST_M:
+            others = [vertical_gap(meshes[number], mesh) for n, mesh in enumerate(meshes) if n != number]
+            gap_m = min(lowest_m, *(gap for gap in others if gap > 0.0), math.inf)
+        if gap_m < -most_mm / 1e3:
+            remedy = f"check.overlap_mm is {most_mm:g}: move it, or raise that"
+            raise _overlap(ending, number, gap_m, remedy, with_floor=gap_m == lowest_m)
+        kept.append(_settled(ending, ending.poses[number], replace(held, gap_m=gap_m), "kept"))
+    return tuple(kept)
+
+
+def _overlap(ending: Ending, number: int, gap_m: float, remedy: str, with_floor: bool) -> SettleError:
+    """What the object of a number is in, and how deep."""
+    forms, poses = ending.placement.forms, (*ending.poses, np.eye(4))
+    names = [f"region {start.region_id} ({start.asset.instance_id})" for start in ending.drop.starts] + ["the table"]
+    others = [n for n in range(len(forms)) if n != number]
+    deepest = min(others, key=lambda n: find_gaps_m([forms[number], forms[n]], [poses[number], poses[n]])[0])
+    body = "the floor" if with_floor else names[deepest]
+    return SettleError("overlap", f"{names[number]} is {-gap_m * 1e3:.2f} mm inside {body}, and {remedy}")
 
 
 def _support_of(ending: Ending) -> SupportedBy:

@@ -18,7 +18,7 @@ from schemas.job.physics import Physics
 from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled
 from workers.geometry.frames import translation
 from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for_with, rooms_m
-from workers.physics.ending import Ending, UnsupportedError, describe, require_calm
+from workers.physics.ending import Ending, UnsupportedError, describe, describe_kept, require_calm
 from workers.physics.fall import Outcome
 from workers.physics.hold import RELEASE_RATE, hold, land, moved_by, release_again
 from workers.physics.placement import (
@@ -325,6 +325,15 @@ def _settle_alone(
         began += starts
         settled += rests
     return renumbered(began), tuple(settled)
+
+
+def keep_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan, most_mm: float) -> Rest:
+    """The scene's objects where they were put, measured there: they need not rest. Raises as `describe_kept`."""
+    drop, poses = Drop(plan.objects, plan.table, physics, effects), tuple(start.T_world_obj for start in plan.objects)
+    for start in drop.starts:
+        require_near_origin(start)
+    placement = _place(drop, poses, forms_of(drop.starts))
+    return Rest(drop.starts, describe_kept(Ending(drop, placement, poses), most_mm))
 
 
 RECHECK_S = 1.0

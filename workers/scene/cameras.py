@@ -187,7 +187,7 @@ def place_more(
             stands = ((T_world @ T, own or others) for T, own in table.of_scene(plan.scene_id))
             named = (NamedCamera(entry.name, n, Camera(k, frozen_array(T))) for n, (T, k) in enumerate(stands))
         for each in named:
-            _require_room(each.name, each.number, each.camera.position, plan, poses)
+            _require_room(each.name, each.number, each.camera.position, plan, poses, by_table=entry.poses is not None)
             if entry.poses is None:
                 require_depth(job, each, points)
             yield each
@@ -382,11 +382,21 @@ def _radical_inverse(number: int) -> float:
     return share
 
 
-def _require_room(name: str, number: int, position: Array, plan: ScenePlan, poses: Sequence[Pose]) -> None:
+def require_aimed(plan: ScenePlan, poses: Sequence[Pose]) -> None:
+    """Raises ViewError where an input camera of a table of scenes stands below the floor, or inside of something."""
+    for number, camera in enumerate(plan.input_cameras):
+        _require_room("input", number, camera.position, plan, poses, by_table=True)
+
+
+def _require_room(
+    name: str, number: int, position: Array, plan: ScenePlan, poses: Sequence[Pose], by_table: bool = False
+) -> None:
     """Raises ViewError where a camera stands below the floor, or inside of an object or of the table."""
+    moves = "raise its inclination, or its about", "take a larger radius_m, or fit"
+    moves = ("move it in its table",) * 2 if by_table else moves
     where = f"camera {name}, number {number}, at ({', '.join(f'{x:.3f}' for x in position)}) m"
     if plan.ground is not None and position[2] <= 0.0:
-        raise ViewError("camera_in_scene", f"{where} is below the floor: raise its inclination, or its about")
+        raise ViewError("camera_in_scene", f"{where} is below the floor: {moves[0]}")
     things = [(each.asset.instance_id, each.asset.shape, T) for each, T in zip(plan.objects, poses, strict=True)]
     if plan.ground is not None:
         things.append(("the table", plan.table.asset.shape, plan.table.T_world_table))
@@ -394,4 +404,4 @@ def _require_room(name: str, number: int, position: Array, plan: ScenePlan, pose
         point, (low, high) = transform(invert(T), position[None, :]), shape.bounds
         # Few cameras are in a box, and to go round one point takes as long as to sort all faces.
         if ((point > low) & (point < high)).all() and abs(winding_numbers(point, shape.mesh)[0]) > 0.5:
-            raise ViewError("camera_in_scene", f"{where} is inside of {what}: take a larger radius_m, or fit")
+            raise ViewError("camera_in_scene", f"{where} is inside of {what}: {moves[1]}")

@@ -31,6 +31,7 @@ class Stream(IntEnum):
     ORBIT = 18
     MORE = 19
     MIRROR = 20
+    GIVEN = 27
 
 
 _SENSORS = {"depth_noise": Stream.SENSOR_DEPTH, "rgb_noise": Stream.SENSOR_RGB, "exposure": Stream.SENSOR_EXPOSURE}

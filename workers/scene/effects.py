@@ -65,12 +65,13 @@ def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPl
     reasons = {effect.name: why(facts) for effect in EFFECTS if (why := effect.skipped_because) is not None}
     for name in names_of_kind("no_op"):
         reason = reasons[name]
-        if reason is not None and not reason.startswith(STUDIO):  # where there is nothing to force
+        if reason is not None and not reason.startswith(UNFORCED):  # where there is nothing to force
             reasons[name] = f"{reason}; proof: exact, forced it changes no byte"
     # Not in the receipt of a job without them, which is then as it was before there were any.
     unasked = set(get_args(ViewTarget)) if not facts.job.targets.views else set()
     unasked |= {"further_views"} if not facts.job.cameras.more and not _is_studio(facts) else set()
     unasked |= {"alpha"} if not _is_studio(facts) else set()
+    unasked |= {"kept_poses"} if facts.job.scenes_from is None else set()
     return _plan({name: why for name, why in reasons.items() if name not in unasked}, forced)
 
 
@@ -118,7 +119,9 @@ def _first_of(*reasons: Reason) -> Reason:
     return lambda facts: next((why for reason in reasons if (why := reason(facts)) is not None), None)
 
 
-STUDIO = "scene is studio"
+STUDIO, KEPT = "scene is studio", "poses of scenes_from are kept"
+UNFORCED = (STUDIO, KEPT)
+"""Begin the reasons of effects that a scene has no use for, which cannot be forced."""
 
 
 def _is_studio(facts: Facts) -> bool:
@@ -129,6 +132,12 @@ def _is_studio(facts: Facts) -> bool:
 def _on_ground(why_not: str, reason: Reason | None = None) -> Reason:
     """An effect that a studio scene has no use for; of others it is skipped for `reason`."""
     return lambda facts: f"{STUDIO}: {why_not}" if _is_studio(facts) else reason(facts) if reason else None
+
+
+def _in_motion(why_not: str, reason: Reason) -> Reason:
+    """An effect of what falls and rests, which a studio scene has no use for, nor one whose poses are kept."""
+    moved = _on_ground(why_not, reason)
+    return lambda facts: f"{KEPT}: {why_not}" if facts.plan.kept else moved(facts)
 
 
 def _stored(part: Role | PixelKind) -> Reason:
@@ -260,7 +269,7 @@ def _of_physics(name: str) -> Effect:
     def skipped_because(facts: Facts) -> str | None:
         return predicate(facts.plan.objects, facts.plan.table, facts.job.physics)
 
-    return Effect(name, kind, _on_ground("nothing falls or rests", skipped_because), "physics")
+    return Effect(name, kind, _in_motion("nothing falls or rests", skipped_because), "physics")
 
 
 PHYSICS_EFFECTS: tuple[Effect, ...] = tuple(_of_physics(name) for name in PREDICATES)
@@ -271,6 +280,12 @@ CAPTURE_EFFECTS: tuple[str, ...] = tuple(name for name, key in Simulate.model_fi
 TABLE: tuple[Effect, ...] = (
     *PHYSICS_EFFECTS,
     *(Effect(name, "asked", None, "physics") for name in ONLY_LATE),
+    Effect(
+        "kept_poses",
+        "asked",
+        _where(lambda facts: facts.plan.kept, "settle is true: objects fall from there"),
+        "physics",
+    ),
     *(Effect(str(role.effect), "asked", _stored(role.name), "render") for role in VIEW_ROLES.values() if role.beside),
     Effect("mirror", "asked", _stored("mirror"), "render"),
     Effect("projection", "asked", _PROJECTION, "projection"),
@@ -292,7 +307,7 @@ TABLE: tuple[Effect, ...] = (
     *(Effect(name, "asked", _target(name), "targets") for name in get_args(ViewTarget)),
     *(Effect(f"sensor_{name}", "asked", _sensor(name), "sensor") for name in SensorEffects.model_fields),
     Effect("raycast_check", "asked", _RAYCAST, "raycast"),
-    Effect("release_again", "asked", _on_ground("nothing rests", _RAYCAST), "recheck"),
+    Effect("release_again", "asked", _in_motion("nothing rests", _RAYCAST), "recheck"),
     Effect("further_views", "asked", _where(lambda facts: facts.job.cameras.more, "cameras.more is empty"), "render"),
     Effect("alpha", "asked", _ALPHA, "targets"),
     Effect("floor", "no_op", _on_ground("there is no floor", _floor), "render", _always),

@@ -10,8 +10,9 @@ from schemas.base import frozen_array
 from schemas.scene.scene import EffectPlan, Placed, PosedScene, ScenePlan, Settled
 from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
 from schemas.scene.view import Pair, View
-from workers.physics.settle import Rest, recheck_scene, settle_scene
-from workers.scene.cameras import frame_cameras, place_more
+from workers.physics.pour import NOTHING_MORE
+from workers.physics.settle import Rest, keep_scene, recheck_scene, settle_scene
+from workers.scene.cameras import frame_cameras, place_more, require_aimed
 from workers.scene.chance import SceneChance
 from workers.scene.context import WorkerContext
 from workers.scene.effects import Facts, is_raycast_scene, plan_effects
@@ -85,8 +86,12 @@ def lay_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> La
         rest = Rest(plan.objects, stand_alone(plan))
         return Laid(place_cameras(context, plan, rest), effects, rest)
     with stopwatch.stage("physics", "dynamics" if effects.runs("dynamics") else None):
-        pouring = pouring_of(job.start, SceneChance(job.seed, scene_id), plan)
-        rest = settle_scene(plan, job.physics, effects, pouring)
+        if effects.runs("kept_poses"):
+            rest = keep_scene(plan, job.physics, effects, job.check.overlap_mm)
+        else:
+            drawn = job.scenes_from is None
+            pouring = pouring_of(job.start, SceneChance(job.seed, scene_id), plan) if drawn else NOTHING_MORE
+            rest = settle_scene(plan, job.physics, effects, pouring)
     plan = replace(plan, objects=rest.starts)
     if effects.runs("release_again"):
         with stopwatch.stage("recheck", "release_again"):
@@ -97,7 +102,10 @@ def lay_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> La
 def place_cameras(context: WorkerContext, plan: ScenePlan, rest: Rest) -> ScenePlan:
     """The plan with the cameras that follow from where its objects rest. Raises ViewError."""
     poses = [each.T_world_obj for each in rest.settled]
-    plan = frame_cameras(context.job, plan, poses)
+    if plan.aimed:
+        require_aimed(plan, poses)
+    else:
+        plan = frame_cameras(context.job, plan, poses)
     chance = SceneChance(context.job.seed, plan.scene_id)
     return replace(plan, more=tuple(place_more(context.job, chance, plan, poses, context.catalogue.poses)))
 

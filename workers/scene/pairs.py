@@ -42,7 +42,8 @@ def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, 
     """
     z = depth_m[object_pixels & (depth_m > 0.0)]
     if z.size == 0:
-        raise ViewError("object_not_seen", "the input view has no depth pixel of the object: narrow start.offset_m")
+        remedy = "narrow start.offset_m, or aim the cameras at it"
+        raise ViewError("object_not_seen", f"the input view has no depth pixel of the object: {remedy}")
     return float(np.percentile(z, mirror.percentile))
 
 

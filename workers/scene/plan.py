@@ -18,12 +18,14 @@ from schemas.scene.scene import Ground, ObjectStart, ScenePlan, Table
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Hull, Mesh
 from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import Catalogue, InstanceRef, choose_object, choose_table, load_asset
+from workers.assets.scene_tables import GivenScene
 from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import hull_of
 from workers.physics.pour import Pouring, points_of
 from workers.physics.support import columns_apart, place_table, sample_elevation, support_height, support_margin
 from workers.scene.cameras import draw_camera
 from workers.scene.chance import SceneChance, Stream
+from workers.scene.given import choose_given, put_given, read_given
 from workers.scene.studio import draw_studio
 
 MOST_REDRAWS = 20
@@ -45,15 +47,17 @@ def plan_scene(job: Job, catalogue: Catalogue, chance: SceneChance) -> ScenePlan
     assets = [load_asset(catalogue, ref) for ref in objects]
     if job.scene == "studio":
         return draw_studio(job, chance, assets[0])
-    return draw_scene(job, chance, load_asset(catalogue, table), *assets)
+    return draw_scene(job, chance, load_asset(catalogue, table), *assets, given=read_given(catalogue, chance.scene_id))
 
 
 def choose_assets(job: Job, catalogue: Catalogue, chance: SceneChance) -> tuple[list[InstanceRef], InstanceRef]:
     """The instances of a scene, before any is loaded: its objects in order, and its table.
 
     Where a job names the instances of splits, an object is drawn until it is of one, and each further object, with its category,
-    until it is of the first one's. Raises StartError where none of `MOST_DRAWS` is.
+    until it is of the first one's. A table of scenes has them by name. Raises StartError where none of `MOST_DRAWS` is.
     """
+    if (given := read_given(catalogue, chance.scene_id)) is not None:
+        return choose_given(catalogue, chance, given)
     objects, split = list[InstanceRef](), job.assets.split
     fit = {*SPLITS}
     for number in range(count_objects(job, chance)):
@@ -92,16 +96,18 @@ def _draw_category(job: Job, rng: np.random.Generator) -> str:
     return names[min(int(np.searchsorted(edges, rng.random(), side="right")), len(names) - 1)]
 
 
-def draw_scene(job: Job, chance: SceneChance, table_asset: Asset, *assets: Asset) -> ScenePlan:
-    """Starts, cameras and look of a scene with these assets. Raises StartError where no start is valid."""
+def draw_scene(
+    job: Job, chance: SceneChance, table_asset: Asset, *assets: Asset, given: GivenScene | None = None
+) -> ScenePlan:
+    """Starts, cameras and look of a scene with these assets, or those `given`. Raises StartError where no start is valid."""
     table = place_table(table_asset)
     rng, further = chance.stream(Stream.CAMERA), chance.stream(Stream.ORBIT)
     centre = np.array([0.0, 0.0, table.top.height_m])
     floor, appearance = draw_appearance(chance.stream(Stream.APPEARANCE), job.render.tier)
     objects: tuple[ObjectStart, ...] = ()
-    for asset in assets:
+    for asset in assets if given is None else ():
         objects += (draw_start(job.start, chance, asset, table, objects),)
-    return ScenePlan(
+    plan = ScenePlan(
         scene_id=chance.scene_id,
         category=assets[0].category,
         ground=Ground(table, floor),
@@ -109,6 +115,7 @@ def draw_scene(job: Job, chance: SceneChance, table_asset: Asset, *assets: Asset
         input_cameras=tuple(draw_camera(rng, further, job.cameras, centre) for _ in range(job.pairs_per_scene)),
         appearance=appearance,
     )
+    return plan if given is None else put_given(plan, job, given, assets)
 
 
 def draw_start(

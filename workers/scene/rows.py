@@ -177,7 +177,7 @@ def scene_row(context: WorkerContext, scene: Scene) -> Row:
         "scene_id": scene.plan.scene_id,
         "table_id": None if table is None else table.asset.instance_id,
         "T_world_table": None if table is None else matrix_column(table.T_world_table),
-        "pose": context.job.start.pose,
+        "pose": context.job.start.pose if context.job.scenes_from is None else "as_given",
         "effects": ran,
         "skipped": skipped,
         **columns_of_bodies(bodies),

@@ -24,9 +24,9 @@ SAMPLED = 8
 def require_framed(job: Job, catalogue: Catalogue) -> None:
     """Raises InputError where none of the first scenes can be planned, or shows an object, whatever physics does with it.
 
-    A job that lets all of its scenes fail is not asked.
+    A job that lets all of its scenes fail is not asked, nor one of a table of scenes, each of which is its user's.
     """
-    if job.captures is not None or job.run.max_failure_share == 1.0:
+    if job.captures is not None or job.scenes_from is not None or job.run.max_failure_share == 1.0:
         return
     reasons = Counter[str]()
     for scene_id in range(job.first_scene, job.first_scene + min(SAMPLED, job.scenes)):

@@ -242,7 +242,13 @@ def _category(context: WorkerContext, scene_id: int) -> str:
     captures = context.job.captures
     if captures is not None and captures.folders:
         return UNNAMED
-    return choose_category(context.job, SceneChance(context.job.seed, scene_id))
+    chance = SceneChance(context.job.seed, scene_id)
+    if context.catalogue.scenes is None:
+        return choose_category(context.job, chance)
+    try:
+        return choose_assets(context.job, context.catalogue, chance)[0][0].category
+    except SceneError:
+        return UNNAMED
 
 
 @lru_cache(maxsize=1)  # a process has one job and, at a time, one renderer

@@ -86,6 +86,8 @@ class StoredPair:
     """Findings of targets, of every view."""
     absent: list[str] = field(default_factory=list)
     """Why targets were not judged: shapes that are not stored."""
+    given: tuple[Sequence[tuple[str | None, Array]], Sequence[Array]] | None = None
+    """Instances and poses of objects, and poses of cameras, that the table of scenes has; None where it is not at hand."""
 
     stands: Mapping[str, Sequence[Stand]] = field(default_factory=dict)
     """Rows of tables of poses that are at hand, by camera."""
@@ -101,6 +103,13 @@ class StoredPair:
         return bool(self.job.get("scene") == "studio")
 
     @property
+    def has_given_cameras(self) -> bool:
+        """Whether a table of scenes has the input cameras, or may have them."""
+        if not self.job.get("scenes_from") or self.job["cameras"]["orbit"].get("always"):
+            return False
+        return self.given is None or bool(self.given[1])
+
+    @property
     def named(self) -> dict[str, Mapping[str, Any]]:
         """The job's further cameras by name."""
         return {entry["name"]: entry for entry in self.job["cameras"].get("more", ())}
@@ -110,11 +119,14 @@ class StoredPair:
         return {row["region_id"]: row for row in self.objects if name_of(row) == name_of(view)}
 
     def sensor(self, view: Row) -> Mapping[str, Any]:
-        """The pinhole camera of a view: the job's, of captures the photograph's; nothing where a table not at hand may say it."""
+        """The pinhole camera of a view: the job's, or the input view's; nothing where a table not at hand may say it.
+
+        The latter of captures, and where a table of scenes has the cameras.
+        """
         sensor: Mapping[str, Any] = self.job["cameras"]["sensor"]
-        if self.is_captured:
-            return {name: self.views["input"][name] for name in sensor}
         entry = self.named.get(view["role"])
+        if self.is_captured or (self.has_given_cameras and (entry is None or entry["beside"])):
+            sensor = {name: self.views["input"][name] for name in sensor}
         if entry is None or not entry["poses"]:
             return sensor if entry is None else sensor_of(entry, sensor)
         row = self.stands.get(entry["name"], ())[view["number"] : view["number"] + 1]

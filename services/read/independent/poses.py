@@ -57,6 +57,26 @@ def check_orbit(pair: StoredPair) -> Iterator[str]:
         yield "the input camera's inclination is outside cameras.orbit.inclination_rad"
 
 
+def check_given(pair: StoredPair) -> Iterator[str]:
+    """Kept objects and the input camera are those of the table of scenes, as far as it is at hand."""
+    if pair.given is None:
+        return
+    view, (objects, cameras), wanted = pair.views["input"], pair.given, list[tuple[str, Array, Array]]()
+    if KEPT in pair.scene["effects"]:
+        if [name or body["instance_id"] for body, (name, _) in zip(pair.bodies, objects, strict=False)] != [
+            body["instance_id"] for body in pair.bodies
+        ]:
+            yield "objects are not those of scenes_from"
+        for body, (_, T) in zip(pair.bodies, objects, strict=False):
+            wanted.append((f"T_world_obj of region {body['region_id']}", matrix(body, "T_world_obj"), T))
+    if pair.has_given_cameras:
+        number = view["parent_id"] // 2 % pair.job["pairs_per_scene"]
+        wanted.append(("T_world_cam of the input view", matrix(view, "T_world_cam"), cameras[number]))
+    yield from (
+        f"{what} is not what scenes_from has" for what, T, other in wanted if not distance(T, other) <= ROUNDING
+    )
+
+
 def check_board(pair: StoredPair) -> Iterator[str]:
     """The board of a capture is the plane z = 0 of its world, in the photograph's depth and in the mirror view's."""
     for role in ("input", "mirror"):
@@ -218,7 +238,9 @@ def check_pair(pair: StoredPair) -> list[str]:
         elif _has_plain_points(pair.job):
             own += derive.check_projection(pair)
         faults += [f"pose {view['pose_id']} ({role}): {fault}" for fault in own]
-    own = [*check_poses(pair), *(check_board if pair.is_captured else check_orbit)(pair), *check_named(pair)]
+    own = [*check_poses(pair), *check_given(pair), *check_named(pair)]
+    if not pair.has_given_cameras:
+        own += (check_board if pair.is_captured else check_orbit)(pair)
     return faults + [f"pair {pair.views['input']['pose_id']}: {fault}" for fault in own]
 
 
@@ -267,6 +289,9 @@ def _check_lines(
             yield f"{', '.join(wrong)} in the line of {at} are not what the tables say"
 
 
+KEPT = "kept_poses"
+"""The effect of scenes that need not rest."""
+
 GRAVITY_M_S2 = 9.81
 
 FRICTION, MOST_FRICTION = 0.7, 10.0
@@ -278,7 +303,7 @@ SHARE = 0.01
 
 def check_forces(job: Mapping[str, Any], scene: Row) -> Iterator[str]:
     """What the forces of a scene's contacts do not explain, a sentence each."""
-    bodies = scene["bodies"]
+    bodies = scene["bodies"] if KEPT not in scene["effects"] else None
     falls = job.get("captures") is None and job.get("scene") != "studio"
     if not bodies or not falls or not job["physics"]["exact_rest"]:
         return

@@ -229,7 +229,7 @@ BAD_POSES: dict[str, tuple[object, str]] = {
     "focal.json": ([row(**PINHOLE | {"fy": 0})], "row 0: fy is 0, and must be from 0.001"),
     "many.json": ([row()] * 1001, "every scene has 1001 rows, and must have 1 to 1000"),
     "other.csv": ("b,a\n1,2\n", "its columns are b, a"),
-    "text.csv": (f"{HEAD}\n{','.join(['x'] * 16)}\n", "column T00 holds something that is no number"),
+    "text.csv": (f"{HEAD}\n{','.join(['x'] * 16)}\n", "CSV conversion error to double: invalid value 'x'"),
     "cut.csv": (f"{HEAD}\n1,2\n", "CSV parse error"),
     "rowless.csv": (f"{HEAD}\n", "has no rows"),
     "empty.json": ("", "Expecting value"),

@@ -143,6 +143,12 @@ class Library:
                 entries.setdefault(row.category, []).append(row)
         return {category: tuple(rows) for category, rows in sorted(entries.items())}
 
+    @cached_property
+    def places(self) -> Mapping[str, tuple[str, int]]:
+        """(category, number among its rows) of every shape that may be used, by its instance id."""
+        rows = ((name, n, row) for name, rows in self.entries.items() for n, row in enumerate(rows))
+        return {row.instance_id: (name, n) for name, n, row in rows if row.use}
+
     def count(self, category: str) -> int:
         """How many rows of a category may be used."""
         return sum(row.use for row in self.entries.get(category, ()))
