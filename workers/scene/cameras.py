@@ -19,7 +19,7 @@ from schemas.job.cameras import SPHERE_SHARE, VIEW_PRESETS, Cameras, Mirror, Mor
 from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, ScenePlan
 from schemas.scene.view import VIEW_ROLES, Camera, Intrinsics, NamedCamera, Role
-from workers.assets.poses import PoseFile, read_poses
+from workers.assets.poses import PoseFile, poses_of
 from workers.assets.winding import winding_numbers
 from workers.geometry.camera import NEAR_M, look_at, orbit_pose, project, yaw
 from workers.geometry.frames import UP, half_turn, invert, pose, rotation_about, transform, translation
@@ -182,9 +182,10 @@ def place_more(
     for entry in job.cameras.more:
         named: Iterator[NamedCamera] = place_orbits(job, entry, chance, plan, points)
         if entry.poses is not None:
-            table, others = read_poses(tables[entry.name]), intrinsics_of(entry, Intrinsics.of(job.cameras.sensor))
-            T_world = poses[0] if table.of_object else np.eye(4)
-            stands = ((T_world @ T, own or others) for T, own in table.of_scene(plan.scene_id))
+            others = intrinsics_of(entry, Intrinsics.of(job.cameras.sensor))
+            of_object, rows = poses_of(tables[entry.name], plan.scene_id)
+            T_world = poses[0] if of_object else np.eye(4)
+            stands = ((T_world @ T, own or others) for T, own in rows)
             named = (NamedCamera(entry.name, n, Camera(k, frozen_array(T))) for n, (T, k) in enumerate(stands))
         for each in named:
             _require_room(each.name, each.number, each.camera.position, plan, poses, by_table=entry.poses is not None)

@@ -518,7 +518,7 @@ def test_forces_of_a_scene_in_balance_have_no_fault_and_each_wrong_one_is_told()
     def faults(edit: Callable, job: dict = JOB) -> str:
         bodies = copy.deepcopy(BODIES)
         edit(*bodies)
-        return "; ".join(check_forces(job, {"scene_id": 7, "bodies": bodies}))
+        return "; ".join(check_forces(job, {"scene_id": 7, "bodies": bodies, "effects": []}))
 
     assert faults(lambda low, high: None) == ""
     for edit, told in (
