@@ -82,6 +82,7 @@ PAGES = {
     "docs/own_meshes.md": pytest.mark.slow,
     "docs/queue.md": pytest.mark.slow,
     "docs/report.md": pytest.mark.slow,
+    "docs/scenes.md": pytest.mark.slow,
     "docs/studio.md": pytest.mark.slow,
     "deploy/README.md": pytest.mark.minute,
     "deploy/examples/README.md": pytest.mark.slow,

@@ -134,7 +134,8 @@ def read_scene(file: PoseFile, scene_id: int) -> GivenScene:
 
 
 def _kind_of(path: Path) -> _Kind:
-    """Raises ValueError for a folder of another kind."""
+    """Raises ValueError for a folder of another kind, OSError where there is nothing."""
+    path.stat()
     if not path.is_dir():
         return _TABLE
     if (path / MANIFEST).is_dir():
