@@ -125,7 +125,7 @@ def test_of_two_on_one_slope_the_one_whose_friction_is_below_its_tangent_slides_
         [*meshes, box_mesh((2.0, 2.0, 0.1), tipped(angle) @ [0.0, 0.0, -0.05], tipped(angle))], 1e-6
     )
     inertias = [thing_of(mesh).inertia(np.eye(4)) for mesh in meshes]
-    motion = step(inertias, contacts, np.array([0.625, 0.5, 0.8]), fall_m * DOWN, G)  # contacts have 0.5 and 0.4
+    motion = step(inertias, np.array([0.625, 0.5, 0.8]), contacts, fall_m * DOWN)  # contacts have 0.5 and 0.4
     down = motion.moves @ tipped(angle)[:, 0]
     slid = fall_m * (math.sin(angle) - 0.4 * math.cos(angle)) / (1.0 + 0.4**2)
     assert down == pytest.approx([0.0, slid], abs=1e-12)

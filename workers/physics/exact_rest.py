@@ -4,8 +4,9 @@ A step begins at rest: gravity, contacts that may not close beyond touching, dry
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 
 import daqp
 import numpy as np
@@ -83,10 +84,9 @@ class JammedError(Exception):
 
 def step(
     bodies: Sequence[Inertia],
-    contacts: Contacts,
     frictions: Array,
+    contacts: Contacts,
     fall: Array,
-    gravity_m_s2: float,
     spinning_m: float = 0.0,
     before: Motion | None = None,
 ) -> Motion:
@@ -125,7 +125,7 @@ def step(
             raise
         away, multipliers = _least_distance(matrix, needed + np.repeat(flush_m / fall_m, edge_count), likely)
     multipliers = multipliers.reshape(edges.shape[:2])
-    forces = gravity_m_s2 * (np.maximum(0.0, -multipliers)[..., None] * edges).sum(axis=1)
+    forces = GRAVITY_M_S2 * (np.maximum(0.0, -multipliers)[..., None] * edges).sum(axis=1)
     moved = (free + away.reshape(free.shape)) * fall_m
     turns = np.stack([root @ each for root, each in zip(roots, moved[:, 3:], strict=True)])
     return Motion(moved[:, :3] / root_masses[:, None], turns, forces, contacts, multipliers)
@@ -289,12 +289,11 @@ def rest(
             near, known_m = find_near_features(surfaces, points, DEEPEST_M + REACH_M), REACH_M
         contacts = find_contacts(surfaces, points, near, REACH_M, DEEPEST_M)
         inertias = [thing.inertia(T) for T, thing in zip(at, things, strict=True)]
-        given = inertias, contacts, frictions
+        move = partial(step, inertias, frictions, spinning_m=spinning_m if number >= most else 0.0)
         try:
-            spun_m = spinning_m if number >= most else 0.0
-            motion, jammed = _step_past_seams(*given, fall_m, spun_m, motion)
+            motion, jammed = _step_past_seams(partial(move, before=motion), contacts, fall_m)
             if _farthest(motion, reaches) <= STILL * fall_m and nudges < MOST_NUDGES and not jammed:
-                nudge, nudges = _nudge(*given, reaches, spun_m, motion), nudges + 1
+                nudge, nudges = _nudge(partial(move, before=motion), contacts, reaches), nudges + 1
                 if _farthest(nudge, reaches) > LEVEL * LEVEL * LONGEST_FALL_M:
                     motion, pushed = nudge, np.zeros(0)
         except JammedError:
@@ -312,27 +311,24 @@ def rest(
     return Rested(at, False, most)
 
 
-def _step_past_seams(
-    bodies: Sequence[Inertia],
-    contacts: Contacts,
-    frictions: Array,
-    fall_m: float,
-    spinning_m: float,
-    before: Motion | None,
-) -> tuple[Motion, bool]:
+Move = Callable[[Contacts, Array], Motion]
+"""`step` of bodies, by contacts and a fall."""
+
+
+def _step_past_seams(move: Move, contacts: Contacts, fall_m: float) -> tuple[Motion, bool]:
     """A step, and whether it left out contacts deeper than `SEAM_M`, which it does where none satisfies all. Raises JammedError.
 
     Edges on the two sides of a thin wall cross as if the wall were overlap: of bowls in one another for the instant in which
     their facets pass. Nothing may come to rest in such a step.
     """
     try:
-        return step(bodies, contacts, frictions, fall_m * DOWN, GRAVITY_M_S2, spinning_m, before), False
+        return move(contacts, fall_m * DOWN), False
     except JammedError:
         shallow = contacts.gaps >= -SEAM_M
         if shallow.all():
             raise
         few = Contacts(*(getattr(contacts, name.name)[shallow] for name in fields(Contacts)))
-        return step(bodies, few, frictions, fall_m * DOWN, GRAVITY_M_S2, spinning_m, before), True
+        return move(few, fall_m * DOWN), True
 
 
 def _farthest(motion: Motion, reaches: Array) -> float:
@@ -350,21 +346,11 @@ def _swings_wider(before: Array, now: Array) -> bool:
     return sizes[1] > sizes[0] and float(before @ now) < -0.5 * sizes[0] * sizes[1]
 
 
-def _nudge(
-    bodies: Sequence[Inertia],
-    contacts: Contacts,
-    frictions: Array,
-    reaches: Array,
-    spinning_m: float,
-    before: Motion,
-) -> Motion:
+def _nudge(move: Move, contacts: Contacts, reaches: Array) -> Motion:
     """The farthest motion of bodies in balance on a ground that leans by `LEVEL` to one of four sides."""
     x, y = LEVEL * math.cos(ASLANT_RAD), LEVEL * math.sin(ASLANT_RAD)
     sides = np.array([[x, y, 0.0], [-y, x, 0.0], [-x, -y, 0.0], [y, -x, 0.0]])
-    motions = [
-        step(bodies, contacts, frictions, LONGEST_FALL_M * (DOWN + side), GRAVITY_M_S2, spinning_m, before)
-        for side in sides
-    ]
+    motions = [move(contacts, LONGEST_FALL_M * (DOWN + side)) for side in sides]
     return max(motions, key=lambda motion: _farthest(motion, reaches))
 
 

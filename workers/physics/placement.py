@@ -18,7 +18,6 @@ from schemas.scene.shape import REGION_TABLE, Mesh
 from workers.geometry.frames import DOWN, motion_between, transform
 from workers.geometry.hull import convex_hull, least_width_m
 from workers.geometry.mesh import bounds_of, hold_to_one_thread, mesh_of, solid_of, weld
-from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.contact_surface import Surface, crop, is_closed, surface_of
 from workers.physics.contacts import Contacts, contacts_within
 from workers.physics.exact_rest import FALL_M, Inertia, Motion, Rested, Thing, rest, step
@@ -239,7 +238,7 @@ def measure_supports(placement: Placement, poses: Sequence[Pose]) -> tuple[Suppo
     touching = contacts_within(placement.surfaces, (*poses, np.eye(4)), TOUCHING_M)
     contacts = replace(touching, gaps=np.zeros_like(touching.gaps))
     inertias = [thing.inertia(T) for T, thing in zip(poses, placement.things, strict=True)]
-    motion = step(inertias, contacts, placement.frictions, FALL_M * DOWN, GRAVITY_M_S2)
+    motion = step(inertias, placement.frictions, contacts, FALL_M * DOWN)
     return tuple(
         _describe(placement, number, inertia, contacts, motion, gap)
         for number, (inertia, gap) in enumerate(zip(inertias, gaps_m, strict=False))
