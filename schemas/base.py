@@ -65,7 +65,7 @@ NonNegative = Annotated[float, Field(ge=0)]
 VALUE_KINDS: Mapping[str, tuple[type, ...]] = {
     "[word]": (str,),
     "[list]": (list, tuple),
-    "[map]": (dict,),
+    "[map]": (dict, BaseModel),
     "[number]": (object,),
 }
 """Marks of the kinds of value that a key may have, of which an error is told of the right one; anything else is a number."""

@@ -153,9 +153,9 @@ def simulate(options: argparse.Namespace) -> int:
     job = capture_job(options.changes, keys)
     assert job.captures is not None
     path, begun = Path(options.out), time.perf_counter()
-    from workers.assets.catalogue import open_catalogue
     from workers.capture.folder import open_folder
     from workers.capture.make_capture import load_object
+    from workers.capture.results import open_sources
     from workers.capture.score import describe_true_grazing
     from workers.capture.simulate.simulate import simulate_capture
     from workers.render.tiers import require_tier
@@ -164,7 +164,7 @@ def simulate(options: argparse.Namespace) -> int:
 
     settings, chance = job.captures.simulate, SceneChance(job.seed, job.first_scene)
     require_tier(Render(tier=settings.tier))
-    catalogue = open_catalogue(job.assets, Path.cwd(), job.categories)
+    catalogue = open_sources(job, Path.cwd())
     asset = load_object(job, catalogue, chance)
     plan = plan_capture(settings)
     truth = simulate_capture(settings, job.captures.printed_board, asset, chance, _make_empty(path))

@@ -138,7 +138,7 @@ def _scene(scene_id: int, category: str, instance: str, table: str) -> dict[str,
         {"scene_id": scene_id, **first, "object_scale": 0.25, "pose": "upright", "redraws": scene_id % 3}
         | {"T_world_obj": matrix_of(scene_id, 1), "T_world_table": matrix_of(scene_id, 2)}
         | {**effects, **_rest(scene_id), "settle_s": 0.7, "raycast_checked": scene_id % 2 == 0}
-        | {"settings_digest": "d" * 64, "capture": None}
+        | {"settings_digest": "d" * 64, "surroundings": None, "capture": None}
         | {"bodies": [_body(scene_id, region, category, instance) for region in (3, 4)]}
     )
 

@@ -44,7 +44,7 @@ FRAMES = {
     "source": "the frame of the file that the shape came from",
 }
 
-Of = Literal["both", "scenes", "rest", "captures", "targets", "more", "friction"]
+Of = Literal["both", "scenes", "rest", "captures", "targets", "more", "look", "friction"]
 
 
 @dataclass(frozen=True)
@@ -64,8 +64,8 @@ class Column:
     """Whether the value may be missing where the column applies."""
     of: Of = "both"
     """The kind of dataset that has it, null in others: `rest`, of scenes on a table; `more`, of jobs with `cameras.more`;
-    `friction`, of jobs with `physics.friction` by category. A table without any value of a column, or of a field of one kind
-    inside one, has the digest of one without it."""
+    `look`, of jobs with surroundings; `friction`, of jobs with `physics.friction` by category. A table without any value of a
+    column, or of a field of one kind inside one, has the digest of one without it."""
 
     @property
     def nullable(self) -> bool:
@@ -82,7 +82,7 @@ _SHARED = {
     "role": "Which view of its pair: input, aligned (the depth camera), mirror, or projected; or the name of a camera of "
     "`cameras.more`.",
     "number": "Number among the views of its role in the scene, from 0; null in the views that every pair has.",
-    "region": "The value of its pixels in segment images: 2 the table, 3 and up the objects.",
+    "region": "The value of its pixels in segment images: 2 the table, 3 and up the objects, 200 and up clutter.",
     "patch": "Share of the patch that shows its object; null where there is no patch.",
     "scale": "Factor from the source's coordinates to metres.",
     "overlap": "Deepest overlap of the true meshes at rest.",
@@ -155,6 +155,18 @@ bodies[].contacts[].with_region | int64 | id | - | The region that it touches th
 bodies[].contacts[].point | double[3] | m | world | Where it touches.
 bodies[].contacts[].normal | double[3] | 1 | world | Unit normal towards the object.
 bodies[].contacts[].force | double[3] | N | world | Force on the object.
+surroundings | struct, look | - | - | What was drawn of the surroundings in `look`; null fields are as built in.
+surroundings.floor | string? | - | - | Picture of the floor, below its folder, or sRGB colour.
+surroundings.floor_tile_m | double? | m | - | Width of that picture on the floor.
+surroundings.table | string? | - | - | Picture of the table, below its folder, or sRGB colour.
+surroundings.table_tile_m | double? | m | - | Width of that picture on the table.
+surroundings.background | string? | - | - | Picture behind everything, below its folder.
+surroundings.room_m | list of double? | m | world | Length along x, width along y, and height of the room inside.
+surroundings.clutter | list of struct? | - | - | Objects that have no other row, in images, masks and depth alone.
+surroundings.clutter[].region_id | int64 | id | - | {region}
+surroundings.clutter[].category | string | - | - | {category}
+surroundings.clutter[].instance_id | string | - | - | {instance}
+surroundings.clutter[].T_world_obj | double[16] | m | world, object | Pose at rest.
 capture | struct, captures | - | - | Quality of the capture.
 capture.name | string | - | - | Name of its folder.
 capture.estimate | string | - | - | Which estimate of the camera poses was taken: markers, article or joint.

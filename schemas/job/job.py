@@ -19,7 +19,7 @@ from schemas.base import Folder, Frozen, NonNegativeInt, Positive, PositiveInt, 
 from schemas.job.assets import CATEGORIES, TABLE, Assets, CategoryName, describe_unknown, offered_by, with_categories
 from schemas.job.cameras import Cameras
 from schemas.job.captures import Captures, with_capture_keys
-from schemas.job.look import Look
+from schemas.job.look import OF_COLOUR, Look
 from schemas.job.physics import ONE_OBJECT, ObjectCount, Physics, Start
 from schemas.job.views import Images, Render, SensorEffects, Studio, Targets
 
@@ -288,6 +288,13 @@ class Job(Frozen):
         return self.scene == "studio" and self.studio.background == "transparent"
 
     @property
+    def drawn_look(self) -> Look:
+        """`look` without the branches that change colour alone, where no colour is drawn or the tier is flat."""
+        if self.render.rgb and self.drawn.tier != "flat":
+            return self.look
+        return self.look.model_copy(update={name: Look.model_fields[name].default for name in OF_COLOUR})
+
+    @property
     def drawn(self) -> Render:
         """How images are drawn: `render`, with the tier of virtual captures where the job makes those."""
         if self.captures is None or self.captures.folders:
@@ -328,6 +335,12 @@ def _unfit_for_scene(job: Job) -> str | None:
         return "scene is studio, and start.pose is placed: use as_given, upright or tumbled, nothing is set down"
     if job.start.arrange == "pile":
         return "scene is studio, and start.arrange is pile: leave it out"
+    if alone := [
+        f"look.{name}" for name in ("floor", "table", "room", "clutter") if getattr(job.look, name) is not None
+    ]:
+        return f"scene is studio, and {' and '.join(alone)} is given: leave it out, an object stands on nothing there"
+    if job.has_alpha and job.look.background is not None:
+        return "studio.background is transparent, and look.background is given: set the former to a colour, such as [1, 1, 1]"
     if job.studio.background == "transparent" and job.sensor.changes_rgb:
         return "sensor asks for an effect on RGB, which alpha cannot follow: set studio.background to a colour, such as [1, 1, 1]"
     if lost := [entry.name for entry in job.cameras.more if entry.about == "table"]:
@@ -357,6 +370,8 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
         return "cameras.depth.enabled is true: leave it out, depth of a capture is registered to its colour camera"
     if job.objects_per_scene != ONE_OBJECT:
         return "objects_per_scene must be 1: a capture is of one object"
+    if given := [name for name, value in job.look if name != "recolour" and value is not None]:
+        return f"look.{given[0]} is given: leave it out, a capture shows its board on a built-in floor"
     if job.sensor != SensorEffects():
         return "sensor has effects: leave them out, those of a virtual capture are keys of captures.simulate"
     if unfit := [name for name in job.targets.views if name in ("albedo", "covisible", "amodal")] + list(
@@ -368,7 +383,10 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
 
 
 PATHS = frozenset(
-    {"assets.objects.folder", "assets.tables.folder", "captures.folders", "cameras.more.poses", "scenes_from"}
+    {
+        *("assets.objects.folder", "assets.tables.folder", "captures.folders", "cameras.more.poses"),
+        *("look.floor.folder", "look.table.folder", "look.background", "scenes_from"),
+    }
 )
 """Keys that name places, where the same files may lie elsewhere."""
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from schemas.base import Array, Pose
-from schemas.scene.shape import Appearance, Asset, Hull, Mesh, Shape
+from schemas.scene.shape import REGION_FIRST_CLUTTER, Appearance, Asset, Hull, Mesh, Shape
 from schemas.scene.view import Camera, NamedCamera
 
 EffectKind = Literal["asked", "no_op", "approximation"]
@@ -64,11 +64,22 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False)
+class Walls:
+    """The walls of a room about the world's origin: their shape, and its length along x, width along y, and height, inside."""
+
+    shape: Shape
+    size_m: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Ground:
-    """What carries the objects of a scene: a table, on a floor."""
+    """What carries the objects of a scene: a table, on a floor, in a room if the job asks for it."""
 
     table: Table
     floor: Shape
+    walls: Walls | None = None
+    cover: Shape | None = None
+    """The table as it is drawn, where the job gives it another surface: the same faces in the same order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +96,11 @@ class ObjectStart:
     redraws: int
     placed: bool
     """Whether it was set down in a stable pose and needs no drop."""
+
+    @property
+    def is_clutter(self) -> bool:
+        """Whether it has no rows."""
+        return self.region_id >= REGION_FIRST_CLUTTER
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +121,13 @@ class ScenePlan:
     """Whether the objects stay where a table of scenes has them, at rest or not."""
     aimed: bool = False
     """Whether a table of scenes has the input cameras."""
+    surroundings: Mapping[str, object] | None = None
+    """What was drawn of `look`, by the fields of `scenes.surroundings`; None where nothing was asked for."""
+
+    @property
+    def shown(self) -> tuple[ObjectStart, ...]:
+        """The objects that have rows; clutter comes after them."""
+        return tuple(start for start in self.objects if not start.is_clutter)
 
     @property
     def table(self) -> Table:

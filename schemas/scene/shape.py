@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +11,18 @@ from schemas.base import Array, Pose
 
 REGION_NOTHING = 0
 REGION_FLOOR = 1
+"""The floor, and the walls of a room."""
 REGION_TABLE = 2
 REGION_FIRST_OBJECT = 3
+REGION_FIRST_CLUTTER = 200
+"""Objects without rows; a scene has at most 50 of either."""
+
+RegionIds = TypeVar("RegionIds", int, NDArray[np.uint8])
+
+
+def is_object(region: RegionIds) -> Any:
+    """Whether region ids, one or an array, are of objects that have rows."""
+    return (region >= REGION_FIRST_OBJECT) & (region < REGION_FIRST_CLUTTER)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +50,8 @@ class Material:
     `transmission` is the share of light not mirrored that crosses the surface as through glass, in the path-traced tier
     alone; `transmission_map` [h, w] uint8 multiplies it, and `ior` is the index of refraction. A transmitting surface is a
     thin sheet; an `ior` of 1 lets all light pass, for the second side of a wall whose first side stands for both.
+    `emission` is light that the surface sends, its colour times this, where white in full light sends 1; tiers without paths draw
+    a surface that mirrors so much more of what arrives, and the path tracer leaves it out.
     `jpeg` is the file that the texture was read from, if it was a JPEG of the same pixels: a copy as PNG has five times its size.
     """
 
@@ -49,6 +62,7 @@ class Material:
     transmission: float = 0.0
     transmission_map: NDArray[np.uint8] | None = None
     ior: float = 1.5
+    emission: float = 0.0
     jpeg: bytes | None = None
 
 
@@ -227,3 +241,5 @@ class Appearance:
     sheen: float = 1.0
     """Share of what Fresnel's term mirrors at grazing angles that is drawn, in the raster tier: light that comes from everywhere
     alike would draw a pale line along every outline."""
+    backdrop: NDArray[np.uint8] | None = None
+    """A picture [h, w, 3] uint8 sRGB in place of the background, which fills every view from edge to edge."""

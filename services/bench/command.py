@@ -29,7 +29,8 @@ from services.job.job_file import change_key, load_job, validate_job
 from services.run.progress import Tally
 from services.run.range_planner import deal_shards, plan_ranges
 from services.run.worker_entry import Pattern, terms_of_driver
-from workers.assets.catalogue import Catalogue, open_catalogue
+from workers.assets.catalogue import Catalogue
+from workers.capture.results import open_sources
 from workers.pool import Ended, Pool
 from workers.store.file_system import file_system_of
 from workers.store.local import LocalStore
@@ -107,7 +108,7 @@ def measure_scaling(
     counts = (1, workers)
     ray: dict[int, list[tuple[Lap, float]]] = {count: [] for count in counts}
     bare: dict[int, list[Lap]] = {count: [] for count in counts}
-    catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
+    catalogue = open_sources(job, job_folder)
     with private_ray(workers), Pool(run_part, processes=workers, quiet=False) as pool:
         runs = _Runs(job, job_folder, folder, catalogue, pool)
         runs.plain("warm", workers, WARM_UP)

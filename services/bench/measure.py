@@ -19,7 +19,7 @@ from schemas.errors import OutputError, RunError, SceneError
 from schemas.job.job import MOST, Job
 from services.bench.figures import Lap, describe_machine, pinned
 from services.bench.script import LOOKS, hand_over, start_script
-from workers.assets.catalogue import open_catalogue
+from workers.capture.results import open_sources
 from workers.geometry.jit import compile_planned
 from workers.render.raster.context import require_device
 from workers.render.raster.gbuffer import FLAT, Renderer
@@ -78,7 +78,7 @@ class Workbench:
 
 def open_workbench(job: Job, job_folder: Path, out: Path) -> Workbench:
     """A workbench for the job's scenes in an empty folder."""
-    catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories))
+    catalogue = open_sources(job, job_folder)
     store = LocalStore(out)
     store.prepare()
     compile_planned()

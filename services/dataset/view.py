@@ -17,7 +17,7 @@ from schemas.dataset.codec import Row, read_camera, read_label, read_matrix
 from schemas.dataset.layout import PixelKind, file_pose_id, patch_index, view_name
 from schemas.errors import InputError
 from schemas.job.views import Patch
-from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE, is_object
 from schemas.scene.view import FULL, LAYERS, MODALITIES, Camera, ObjectLabel, Role, crop_box
 from services.read.dataset_reader import patch_paths, view_paths
 from workers.geometry.camera import project, unproject
@@ -203,7 +203,7 @@ class Pixels:
         """
         (depth_m, regions), mask = self.layers(), self.segment()
         back_m, back_region = self.image("back") / self.depth_units_per_m, self.image("back_region")
-        counts = (mask >= REGION_FIRST_OBJECT) & (regions[0] == mask) & (back_region == mask)
+        counts = is_object(mask) & (regions[0] == mask) & (back_region == mask)
         counts &= ((regions == mask) | (regions == 0)).all(axis=0) & (depth_m[0] > 0.0) & (back_m > 0.0)
         rows, columns = np.nonzero(counts)
         rays = unproject(rows, columns, np.ones(len(rows)), self.camera.intrinsics)

@@ -23,7 +23,7 @@ from schemas.dataset.codec import Row
 from schemas.dataset.layout import PixelKind
 from schemas.errors import plural
 from schemas.job.assets import BUILT_IN
-from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.shape import REGION_FIRST_OBJECT, is_object
 from schemas.scene.view import Role
 from services.export.formats import Writer
 from services.export.source import MM_PER_M, ExportPair, ExportScene, in_units
@@ -187,7 +187,7 @@ class Nocs(Writer):
             meta += f"{number} {own_class} {_synset(category)} {escaped(name)}\n"
         coordinates = np.rint(codes[..., _STORED_AXES] / _STEPS).astype(np.uint8)
         # Objects count from 1.
-        numbers = np.where(region < REGION_FIRST_OBJECT, BACKGROUND, region - (REGION_FIRST_OBJECT - 1))
+        numbers = np.where(is_object(region), region - (REGION_FIRST_OBJECT - 1), BACKGROUND)
         files = {"color.png": rgb, "coord.png": encode_png(coordinates), "depth.png": depth}
         files |= {"mask.png": encode_png(numbers.astype(np.uint8)), "meta.txt": meta.encode()}
         for name, data in files.items():

@@ -14,7 +14,7 @@ import numpy as np
 from schemas.dataset.codec import Row, read_matrix, read_world_poses
 from schemas.dataset.layout import view_name
 from schemas.errors import CorruptError, SceneError, VersoError
-from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.shape import is_object
 from schemas.scene.view import DRAWN_ROLES, Role
 from services.export.formats import LeftOut, Writer, encode_json
 from services.export.source import MM_PER_M, SIDES, ExportPair, ExportScene
@@ -123,7 +123,7 @@ class Nerf(Writer):
         view, name = pair.views[role], f"{pair.views[role]['parent_id']:05d}_{role}.png"
         rgb, depth, region = pair.image(role, "rgb"), pair.depth(role, MM_PER_M), pair.pixels(role, "region")
         assert rgb is not None and depth is not None and region is not None
-        files = {"images": rgb, "depths": depth, "masks": encode_mask(region >= REGION_FIRST_OBJECT)}
+        files = {"images": rgb, "depths": depth, "masks": encode_mask(is_object(region))}
         keys = {"images": ("file_path",), "depths": ("depth_file_path", "depth_path"), "masks": ("mask_path",)}
         kinds = ["images"] if self._lens else list(files)
         for kind in kinds:

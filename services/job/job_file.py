@@ -15,6 +15,7 @@ from schemas.dataset.layout import SWITCHES, is_stored
 from schemas.errors import JobError, did_you_mean, plain_line
 from schemas.job.assets import SOURCE_KINDS
 from schemas.job.job import Job
+from schemas.job.look import OF_COLOUR
 from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
 from services.job.packed import is_packed, pack, unpack
 
@@ -152,7 +153,7 @@ def folders_of(job: Job) -> dict[str, str]:
         for number, source in enumerate(getattr(job.assets, branch))
     }
     folders = job.captures.folders if job.captures is not None else []
-    return sources | {f"captures.folders.{number}": folder for number, folder in enumerate(folders)}
+    return sources | job.look.folders | {f"captures.folders.{number}": name for number, name in enumerate(folders)}
 
 
 def refuse_folders(job: Job, name: str, fits: Callable[[str], bool], why: str) -> None:
@@ -272,6 +273,7 @@ NEEDS: dict[str, tuple[tuple[str, Acts], ...]] = {
     "start.arrange": (_SEVERAL,),
     "start.pile_offset_m": (_SEVERAL, _PILE),
     "physics.concavity": (_PARTS,),
+    **{f"look.{name}": (_COLOUR, ("render.tier is flat", lambda job: job.render.tier != "flat")) for name in OF_COLOUR},
     "studio.size_m": (("studio.scale is metric", lambda job: job.studio.scale != "metric"),),
 }
 """Keys of scenes by what must hold for them to act: a phrase for where it does not, and whether it does."""
@@ -288,5 +290,5 @@ def describe_idle(job: Job) -> list[str]:
         value, usual = getattr(model, name), type(model).model_fields[name].default
         why = next((phrase for phrase, acts in needs if not acts(job)), None)
         if value != usual and why is not None:
-            lines.append(f"{key} is {value} and has no effect: {why}")
+            lines.append(f"{key} is {'given' if isinstance(value, BaseModel) else value} and has no effect: {why}")
     return lines

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.errors import VersoError
-from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE, is_object
 from services.dataset.dataset import Dataset
 from services.dataset.view import View
 from services.look.pictures import SHOWN_ROLES
@@ -121,7 +121,7 @@ def cloud_of(view: View, target: Array, most_points: int) -> Cloud:
     for group in (region >= REGION_FIRST_OBJECT, region == REGION_TABLE, region == REGION_FLOOR):
         kept = np.append(kept, _evenly(np.flatnonzero(near & group), most_points - len(kept)))
     colors = np.full((len(kept), 3), 150, np.uint8) if seen.colours is None else seen.colours[kept]
-    ours = z[region >= REGION_FIRST_OBJECT]
+    ours = z[is_object(region)]
     size_m = float(np.median(ours if ours.size else z)) / view.camera.intrinsics.fx if z.size else 0.01
     return Cloud(view.role, seen.points[kept], colors, size_m, view.T_world_cam)
 

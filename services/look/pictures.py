@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 from trimesh.visual.color import interpolate
 
-from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
+from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, is_object
 from schemas.scene.view import MODALITIES, PixelKind
 from services.dataset.dataset import Dataset
 from services.dataset.pair import Pair
@@ -252,7 +252,7 @@ def show_pair(pair: Pair, depth: dict[str, Histogram], kinds: Collection[PixelKi
             has_targets = kinds is None and set(patch.images) - set(PLAIN)
             pictures |= view_pictures(role, _read_images(patch, None if has_targets else plain), units_per_m, PATCH)
         if {"depth", "region"} <= whole.keys():
-            of_objects = (whole["region"] >= REGION_FIRST_OBJECT) & (whole["depth"] > 0)
+            of_objects = is_object(whole["region"]) & (whole["depth"] > 0)
             depth[role] = depth[role].add(whole["depth"][of_objects] / units_per_m)
     if pair.mirror is not None and pair.projected is not None and "rgb" in pair.projected.images:
         over = "input view projected over the mirror view"

@@ -13,12 +13,11 @@ from schemas.dataset.layout import (
 )
 from schemas.dataset.shard import Fingerprint
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, SORT_KEYS
-from schemas.errors import CorruptError, MachineError, VersoError
+from schemas.errors import CorruptError, MachineError
 from schemas.job.job import job_digest
 from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord, require_job
 from services.read.dataset_reader import StoredRange, committed_reader, decode_samples, file_reader, find_scene
-from workers.assets.catalogue import Catalogue
 from workers.capture.results import open_sources
 from workers.scene.context import WorkerContext, open_worker
 from workers.shard.fingerprint import take_fingerprint
@@ -77,15 +76,6 @@ def open_context(record: JobRecord) -> WorkerContext:
         changed = record.describe_change(tuple(listing.sha256 for listing in catalogue.captures))
         raise MachineError(f"{changed} (from {record.folder}) do not hold what they held when this job was run")
     return open_worker(record.job, catalogue)
-
-
-def open_unchanged(record: JobRecord) -> Catalogue | None:
-    """The sources of a stored job; None where they are not here, or not what they were when it was run."""
-    try:
-        catalogue = open_sources(record.job, Path(record.folder))
-    except (VersoError, OSError):
-        return None
-    return catalogue if catalogue.digest == record.catalogue else None
 
 
 def is_same_stack(store: Store, context: WorkerContext) -> bool:

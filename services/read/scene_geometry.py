@@ -51,11 +51,10 @@ class Sources:
             from workers.scene.chance import SceneChance
             from workers.scene.plan import choose_assets
             from workers.scene.studio import scaled_to
-        catalogue = self._opened
-        if isinstance(catalogue, InputError):
-            raise InputError(f"{missing} its source cannot be read here: {catalogue}") from catalogue
-        if isinstance(catalogue, Exception):
-            raise catalogue
+        try:
+            catalogue = self.catalogue
+        except InputError as error:
+            raise InputError(f"{missing} its source cannot be read here: {error}") from error
         objects, table = choose_assets(self._record.job, catalogue, SceneChance(self._record.job.seed, scene_id))
         ref = next(
             (one for one in (*objects, table) if (one.category, one.instance_id) == (category, instance_id)), None
@@ -66,6 +65,13 @@ class Sources:
             )
         asset, job = load_asset(catalogue, ref), self._record.job
         return scaled_to(asset, job.studio) if job.scene == "studio" else asset
+
+    @property
+    def catalogue(self) -> "Catalogue":
+        """The job's catalogue. Raises as it was opened."""
+        if isinstance(self._opened, Exception):
+            raise self._opened
+        return self._opened
 
     @cached_property
     def _opened(self) -> "Catalogue | VersoError | OSError":
@@ -135,7 +141,7 @@ def pose_shapes(store: Store, stored: StoredRange, row: Row, record: JobRecord, 
     if record.job.captures is not None:
         placed.append((f"board {names.pop(REGION_TABLE)[1]}", REGION_TABLE, [("board", _board(stored, row))]))
     elif REGION_TABLE in names:
-        placed.append(("floor", REGION_FLOOR, _floor(record, row["scene_id"])))
+        placed.append(("floor", REGION_FLOOR, _floor(record, sources, row["scene_id"])))
     for region_id, of in names.items():
         # Two objects may be of one instance: only the region id tells them apart.
         region = f" {region_id}" if len(T_world) > 3 and region_id >= REGION_FIRST_OBJECT else ""
@@ -147,15 +153,17 @@ def pose_shapes(store: Store, stored: StoredRange, row: Row, record: JobRecord, 
     return scene
 
 
-def _floor(record: JobRecord, scene_id: int) -> list[Named]:
+def _floor(record: JobRecord, sources: Sources, scene_id: int) -> list[Named]:
     try:
         with needs_making("the floor"):
             from workers.assets.appearance import draw_appearance
             from workers.scene.chance import SceneChance, Stream
+            from workers.scene.surround import lay_floor
     except MachineError:
         return []
-    chance = SceneChance(record.job.seed, scene_id)
+    chance, look = SceneChance(record.job.seed, scene_id), record.job.drawn_look
     floor, _ = draw_appearance(chance.stream(Stream.APPEARANCE), record.job.render.tier)
+    floor = floor if look.floor is None else lay_floor(look.floor, sources.catalogue, chance, floor)[0]
     return [(part.name, mesh_of_part(part)) for part in floor.parts]
 
 

@@ -30,7 +30,7 @@ from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import InputError, VersoError
 from schemas.job.assets import Split
 from schemas.job.job import Job
-from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
+from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh, is_object
 from services.dataset.pair import Pair, carry
 from services.dataset.view import View
 from services.score.images import Alignment, align_depth, score_colour, score_depth
@@ -208,7 +208,7 @@ class Truth:
     @cached_property
     def parts(self) -> Mapping[str, NDArray[np.bool_]]:
         """[H, W] bool by name, as the head of this file has them."""
-        mask = self.segment >= REGION_FIRST_OBJECT
+        mask = is_object(self.segment)
         if "covisible" in self.view.images:
             seen = self.view.covisible() & (self.units > 0)
         else:
@@ -255,15 +255,13 @@ class Truth:
 def _outline(segment: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """[H, W]: pixels within `BOUNDARY_PX` of another region, if either is of an object."""
     outline = np.zeros(segment.shape, np.bool_)
-    rows, columns = np.divmod(
-        np.flatnonzero(segment >= REGION_FIRST_OBJECT), segment.shape[1]
-    )  # 4 times nonzero's speed
+    rows, columns = np.divmod(np.flatnonzero(is_object(segment)), segment.shape[1])  # 4 times nonzero's speed
     if not len(rows):
         return outline
     near = tuple(
         slice(max(int(at.min()) - BOUNDARY_PX - 1, 0), int(at.max()) + BOUNDARY_PX + 2) for at in (rows, columns)
     )
-    crop = np.where(segment[near] >= REGION_FIRST_OBJECT, segment[near], 0)
+    crop = np.where(is_object(segment[near]), segment[near], 0)
     size = 2 * BOUNDARY_PX + 1
     outline[near] = ndimage.maximum_filter(crop, size, mode="nearest") != ndimage.minimum_filter(
         crop, size, mode="nearest"

@@ -22,7 +22,7 @@ from services.study.choose import recommend
 from services.study.model import ERRORS, Study, Targets, apply, choose_knobs, job_tree_with, knobs_of, settings_of
 from services.study.study import Journal, Plan, run_study
 from services.study.truths import colour_truth_missing
-from workers.assets.catalogue import open_catalogue
+from workers.capture.results import open_sources
 from workers.render.raster.context import require_device
 from workers.render.tiers import require_tier
 from workers.scene.context import open_worker
@@ -54,7 +54,7 @@ def main(options: argparse.Namespace) -> int:
     targets = parse_targets(options.target) if options.target else None
     plan, notes = make_plan(load_job(options.job, options.changes), options, targets)
     require_tier(plan.job.render)
-    catalogue = open_catalogue(plan.job.assets, plan.job_folder, tuple(plan.job.categories))
+    catalogue = open_sources(plan.job, plan.job_folder)
     context = open_worker(plan.job, catalogue)
     require_device(context.renderer.name, plan.job.run.device, context.renderer.choice)
     print(f"measures for at most {describe_seconds(plan.budget_s)} (--budget), {plan.processes} scenes at a time")

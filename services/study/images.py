@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from schemas.errors import SceneError
 from schemas.job.views import Images
-from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.shape import is_object
 from schemas.scene.view import Camera, Pair, View
 from services.study.measure import Answer, answer_for, context_for, laid_for, own_rest, warm_answer_for
 from services.study.model import OWN, Setting, resized
@@ -104,9 +104,9 @@ def _of_labels(views: Sequence[tuple[View, Seen]], images: Images) -> dict[str, 
     differ = pixels = 0
     for view, seen in views:
         assert view.region is not None
-        mask, by_ray = seen.of(view.region), seen.region >= REGION_FIRST_OBJECT
-        by_mask = mask >= REGION_FIRST_OBJECT
-        outside = np.count_nonzero(view.region >= REGION_FIRST_OBJECT) - np.count_nonzero(by_mask)
+        mask, by_ray = seen.of(view.region), is_object(seen.region)
+        by_mask = is_object(mask)
+        outside = np.count_nonzero(is_object(view.region)) - np.count_nonzero(by_mask)
         differ += int(np.count_nonzero((mask != seen.region) & (by_ray | by_mask)) + outside)
         pixels += int(np.count_nonzero(by_ray))
         off_mm.append(_off_mm(seen.of(view.depth), mask, seen, images))
@@ -142,7 +142,7 @@ def _of_projections(pairs: Sequence[Pair], truth: Truth, images: Images) -> dict
 
 def _off_mm(stored: NDArray[np.uint16], mask: NDArray[np.uint8], seen: Seen | Patch, images: Images) -> Array:
     """[N] |stored depth - ray's z| of pixels with depth whose mask and ray name the same object."""
-    same = (seen.region >= REGION_FIRST_OBJECT) & (mask == seen.region) & (stored > 0)
+    same = is_object(seen.region) & (mask == seen.region) & (stored > 0)
     return np.abs(dequantise_depth(stored[same], images) - seen.depth_m[same]) * 1e3
 
 

@@ -22,7 +22,7 @@ from services.study.images import measure_colour, measure_drawn
 from services.study.measure import LIMIT, RESTS, measure_capture, measure_rest
 from services.study.model import OWN, Proof, Row, Setting, Study, Targets, apply, joined
 from services.study.table import AT_REST, PARTS, Part, Table, figures_of, part_of, split_settings, unit_name
-from workers.assets.catalogue import open_catalogue
+from workers.capture.results import open_sources
 from workers.pool import Answers, Ended, Pool
 from workers.scene.context import WorkerContext, open_worker
 from workers.shard.run_shard import run_scene
@@ -85,7 +85,7 @@ def _worker(job: str, folder: str, changes: str) -> WorkerContext:
         own = _worker(job, folder, "{}")
         return replace(own, job=apply(own.job, json.loads(changes)))
     parsed = Job.model_validate_json(job)
-    context = open_worker(parsed, open_catalogue(parsed.assets, Path(folder), tuple(parsed.categories)))
+    context = open_worker(parsed, open_sources(parsed, Path(folder)))
     if parsed.captures is None:
         few = replace(context, job=apply(parsed, {"objects_per_scene": 1}))
         for scene_id in WARM_SCENES:

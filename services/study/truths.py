@@ -20,7 +20,7 @@ from schemas.base import Array
 from schemas.errors import InputError
 from schemas.job.views import Render
 from schemas.scene.scene import Ground, Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR
+from schemas.scene.shape import REGION_FLOOR, is_object
 from schemas.scene.view import Camera, Intrinsics
 from workers.assets.appearance import draw_appearance
 from workers.geometry.camera import NEAR_M, project, project_bounds, unproject
@@ -120,7 +120,7 @@ class Eye:
 
     def vertices(self) -> Array:
         """[V, 3] float64: the vertices of the objects, which are all things but floor and table."""
-        objects = [thing for thing in self.things if thing.region_id >= REGION_FIRST_OBJECT]
+        objects = [thing for thing in self.things if is_object(thing.region_id)]
         vertices = [transform(thing.T_world_shape, thing.shape.vertices) for thing in objects]
         return np.concatenate([np.empty((0, 3)), *vertices])
 
@@ -158,7 +158,7 @@ def cast_patch(things: Sequence[Placed], camera: Camera, *names: int) -> Patch:
     cell = ((right - left) / DENSE, (bottom - top) / DENSE)
     rows, columns = (index.ravel() for index in np.mgrid[0:DENSE, 0:DENSE])
     depth_m, region = eye.cast(left + cell[0] * (columns + 0.5), top + cell[1] * (rows + 0.5))
-    mine = region >= REGION_FIRST_OBJECT
+    mine = is_object(region)
     if not mine.any():
         return NOTHING
     rows, columns, dense_m = rows[mine], columns[mine], float(depth_m[mine].min())
@@ -176,7 +176,7 @@ def cast_patch(things: Sequence[Placed], camera: Camera, *names: int) -> Patch:
 
 def seen_by_other(things: Sequence[Placed], camera: Camera, seen: Seen, other: Camera) -> NDArray[np.bool_]:
     """[N] bool: whether the object point that each ray hits is visible in the other camera's image too."""
-    mine = np.flatnonzero(seen.region >= REGION_FIRST_OBJECT)
+    mine = np.flatnonzero(is_object(seen.region))
     points = unproject(seen.rows[mine], seen.columns[mine], seen.depth_m[mine], camera.intrinsics)
     there = transform(invert(other.T_world_cam) @ camera.T_world_cam, points)
     before = there[:, 2] > NEAR_M

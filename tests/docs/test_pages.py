@@ -84,6 +84,7 @@ PAGES = {
     "docs/report.md": pytest.mark.slow,
     "docs/scenes.md": pytest.mark.slow,
     "docs/studio.md": pytest.mark.slow,
+    "docs/surroundings.md": pytest.mark.slow,
     "deploy/README.md": pytest.mark.minute,
     "deploy/examples/README.md": pytest.mark.slow,
 }

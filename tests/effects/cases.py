@@ -5,8 +5,10 @@ Effects of physics have theirs in physics_cases.py.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, get_args
 
+from schemas.job.look import Look
 from schemas.job.views import ViewTarget
 from tests.effects.scenes import (
     ABOVE_THE_HORIZON,
@@ -43,6 +45,29 @@ def _target(name: str) -> Case:
     views = {"views": [other, name]}, {"views": [other]}
     return _asked({"targets": views[0]}, {"targets": views[1]}, f"targets.views has no {name}")
 
+
+def _look(name: str, branch: str, value: Any) -> Case:
+    """Asked for; not where another branch is asked for."""
+    other = {"floor": {"colours": [RED]}} if branch != "floor" else {"table": {"colours": [RED]}}
+    usual = Look.model_fields[branch].default or "off"
+    return _asked({**BEHIND.get(name, {}), "look": {branch: value}}, {"look": other}, f"look.{branch} is {usual}")
+
+
+RED, BLUE = (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)
+
+BEHIND = {"backdrop": ABOVE_THE_HORIZON}
+"""Keys of a scene in which the effect is seen, where any other scene does not show it."""
+
+PICTURES = str(Path(__file__).parents[2] / "docs" / "images")
+
+SURROUNDINGS: dict[str, tuple[str, Any]] = {
+    "recolour": ("recolour", {"hue": [[0.6, 0.65]]}),
+    "floor_cover": ("floor", {"colours": [RED]}),
+    "table_cover": ("table", {"colours": [BLUE]}),
+    "backdrop": ("background", PICTURES),
+    "room": ("room", {"size_m": [4.5, 5.0]}),
+    "clutter": ("clutter", {"count": 2}),
+}
 
 NOISY = {
     "sensor": {"depth_noise": {}},
@@ -81,6 +106,7 @@ ASKED: dict[str, Case] = {
     "release_again": _asked({"check": {"raycast_share": 1.0}}, {}, "not in the share check.raycast_share"),
     **{name: _target(name) for name in TARGETS},
     "further_views": _asked({**STUDIO, **merged(FRAMED, AROUND)}, {**STUDIO, **FRAMED}, "cameras.more is empty"),
+    **{name: _look(name, branch, value) for name, (branch, value) in SURROUNDINGS.items()},
     "alpha": _asked(
         {**STUDIO, **FRAMED},
         {**STUDIO, **FRAMED, "studio": {"background": [0.0, 0.0, 0.0]}},
@@ -93,7 +119,7 @@ ASKED: dict[str, Case] = {
     ),
 }
 
-OF_OTHERS = {*TARGETS, "further_views", "alpha", "kept_poses"}
+OF_OTHERS = {*TARGETS, *SURROUNDINGS, "further_views", "alpha", "kept_poses"}
 """Effects that the receipt of a job does not name which has nothing of their kind."""
 
 NO_OPS: dict[str, Case] = {

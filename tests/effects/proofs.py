@@ -9,7 +9,7 @@ import numpy as np
 
 from schemas.errors import SceneError, SettleError
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE
-from tests.effects.cases import ASKED, NO_OPS, RASTER, TARGETS, TRACED, WITHOUT_MIRROR
+from tests.effects.cases import ASKED, BEHIND, NO_OPS, RASTER, SURROUNDINGS, TARGETS, TRACED, WITHOUT_MIRROR
 from tests.effects.physics_cases import PHYSICS
 from tests.effects.physics_scenes import facts_with
 from tests.effects.scenes import Made, Setting, make, without_textures
@@ -186,6 +186,7 @@ PROOFS: dict[str, Proof] = {
     "raycast_check": Proof(CHECKED, only_with(lambda made: "raycast" in made.stopwatch.seconds)),
     "release_again": Proof(CHECKED, only_with(lambda made: made.scene.settled[0].recheck_move_mm is not None)),
     **{name: switched(name) for name in (*TARGETS, "further_views", "alpha")},
+    **{name: Proof(ASKED[name].needs, same_as(Setting(BEHIND.get(name, {})))) for name in SURROUNDINGS},
     "floor": Proof(NO_OPS["floor"].needs, sees(REGION_FLOOR)),
     "table": Proof(NO_OPS["table"].needs, sees(REGION_TABLE)),
     "textures": Proof(NO_OPS["textures"].needs, same_as(Setting({}, without_textures))),

@@ -16,8 +16,9 @@ from schemas.job.job import Job, settings_digest
 from schemas.scene.scene import Ground, ScenePlan
 from schemas.scene.shape import Part, Shape
 from services.job.job_file import validate_job
-from workers.assets.catalogue import Catalogue, open_catalogue
+from workers.assets.catalogue import Catalogue
 from workers.assets.scene_tables import open_scenes
+from workers.capture.results import open_sources
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.chance import SceneChance
 from workers.scene.context import WorkerContext
@@ -25,6 +26,7 @@ from workers.scene.effects import Facts, is_raycast_scene
 from workers.scene.make_scene import Scene, make_scene
 from workers.scene.plan import plan_scene
 from workers.scene.rows import record_scene
+from workers.scene.surround import surround
 from workers.stopwatch import Stopwatch
 
 SMALL: dict[str, Any] = {
@@ -83,8 +85,9 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
 
 
 @cache
-def _catalogue(categories: tuple[str, ...]) -> Catalogue:
-    return open_catalogue(Job(name="c").assets, Path(), categories)
+def _catalogue(categories: tuple[str, ...], look: str) -> Catalogue:
+    job = validate_job({"name": "c", "categories": list(categories), "look": json.loads(look)}, "a test")
+    return open_sources(job, Path())
 
 
 TABLES = tempfile.TemporaryDirectory(prefix="verso-tests-scenes-")
@@ -99,7 +102,8 @@ def above_the_table(settle: bool) -> str:
 
 
 def context_of(job: Job, forced: Iterable[str] = (), withdrawn: Iterable[str] = ()) -> WorkerContext:
-    catalogue = replace(_catalogue(tuple(job.categories)), scenes=open_scenes(job, Path()))
+    catalogue = _catalogue(tuple(job.categories), job.drawn_look.model_dump_json())
+    catalogue = replace(catalogue, scenes=open_scenes(job, Path()))
     digest = settings_digest(job, catalogue.digest)
     return WorkerContext(job, catalogue, shared_renderer(), digest, frozenset(forced), frozenset(withdrawn))
 
@@ -107,7 +111,8 @@ def context_of(job: Job, forced: Iterable[str] = (), withdrawn: Iterable[str] = 
 def facts_of(setting: Setting) -> Facts:
     """What the plan of effects is made from."""
     job, chance = setting.job, SceneChance(setting.job.seed, setting.scene_id)
-    plan = setting.edit(plan_scene(job, context_of(job).catalogue, chance))
+    catalogue = context_of(job).catalogue
+    plan = surround(job, job.drawn_look, catalogue, chance, setting.edit(plan_scene(job, catalogue, chance)))
     return Facts(job, plan, is_raycast_scene(job.check, chance))
 
 

@@ -34,7 +34,7 @@ def draw_appearance(rng: np.random.Generator, tier: Tier) -> tuple[Shape, Appear
     if tier == "flat":
         return _floor(_plain_material(rng)), _two_lights(rng)
     material, period_m = draw_floor_material(rng)
-    return _floor(material, _floor_uv(rng, period_m)), _studio(rng)
+    return _floor(material, floor_uv(rng, period_m)), _studio(rng)
 
 
 _CORNERS = frozen_array(
@@ -48,8 +48,8 @@ def _floor(material: Material, uv: Array | None = None) -> Shape:
     return Shape((Part("floor", _CORNERS, _FACES, material, uv=uv),))
 
 
-def _floor_uv(rng: np.random.Generator, period_m: float) -> Array:
-    """uv [4, 2] of the floor's corners, at a random angle and offset."""
+def floor_uv(rng: np.random.Generator, period_m: float | Array) -> Array:
+    """uv [4, 2] of the floor's corners, at a random angle and offset; `period_m`: of both axes, or [2] along u and v."""
     angle, shift = rng.uniform(-math.pi, math.pi), rng.random(2)
     turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     return frozen_array(_CORNERS[:, :2] @ turn.T / period_m + shift)

@@ -48,7 +48,7 @@ def bop_ids(path: Path) -> Array:
 def bop_rows(path: Path, scene_id: int) -> list[dict[str, Any]]:
     """Objects where the first image has them, and the cameras of all images; of an export of ours those of input views.
 
-    Raises ValueError, KeyError and OSError.
+    Other models have frames of their own: poses are those of their sources. Raises ValueError, KeyError and OSError.
     """
     names, size, *_ = bop_files(path)
     folder, root, image = find_bop_scenes(path)[scene_id], names.parent, json.loads(size.read_bytes())
@@ -67,11 +67,12 @@ def bop_rows(path: Path, scene_id: int) -> list[dict[str, Any]]:
     if unknown := {body["obj_id"] for body in objects[first]} - instances.keys():
         raise ValueError(f"{names} has no obj_id {min(unknown)}: add its line")
     T_world_obj = [T_world_cam[first] @ _from_mm(body["cam_R_m2c"], body["cam_t_m2c"]) for body in objects[first]]
+    is_ours = (root / "export.json").exists()
     bodies = [
-        {"instance_id": instances[body["obj_id"]], "T_world_obj": T.tolist()}
+        {"instance_id": instances[body["obj_id"]], "T_world_obj": T.tolist(), "of_source": not is_ours}
         for body, T in zip(objects[first], T_world_obj, strict=True)
     ]
-    step = len(DRAWN_ROLES) if (root / "export.json").exists() else 1
+    step = len(DRAWN_ROLES) if is_ours else 1
     return bodies + [
         {
             "T_world_cam": T.tolist(),

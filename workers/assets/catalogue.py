@@ -29,12 +29,14 @@ from schemas.job.assets import (
     instance_id,
 )
 from schemas.job.job import differing_keys
+from schemas.job.look import Recolour
 from schemas.scene.shape import Asset
 from workers.assets.poses import PoseFile
 from workers.geometry.frames import add_up
 
 if TYPE_CHECKING:
     from workers.assets.library.table import Library
+    from workers.assets.pictures import Pictures
 
 AnySource = ProceduralSource | LibrarySource
 
@@ -78,6 +80,10 @@ class Catalogue:
     """Tables of camera poses by the name of their camera; the digest covers them too."""
     scenes: PoseFile | None = None
     """The table of scenes that the job names; the digest covers it too."""
+    recolour: Recolour = "as_made"
+    """Colours of built-in objects; the digest covers them too."""
+    pictures: "Pictures" = field(default_factory=dict)
+    """Those of the folders of `look`; the digest covers them too."""
 
     def offers(self, category: str) -> list[tuple[int, AnySource, int]]:
         """Number, settings and count of instances of every source that has this category."""
@@ -127,22 +133,17 @@ class Catalogue:
 
     def find(self, name: str, tables: bool = False) -> InstanceRef | None:
         """The instance of an object, or of a table, by its id; None where no source has it."""
+        stem, _, index = name.rpartition("-")
         for number, (settings, library) in enumerate(self._sources(TABLE if tables else "")):
-            if isinstance(settings, ProceduralSource):
-                for category in (TABLE,) if tables else CATEGORIES:
-                    kind, _, index = name.rpartition("-")
-                    if kind == f"{settings.named(category)}-{settings.seed}" and index.isdecimal():
-                        ref = self.refer(number, category, int(index))
-                        if ref.instance_id == name and ref.index < settings.instances:
-                            return ref
+            if library is not None:  # whose names may end in a size
+                places = [library.places[each] for each in (name, stem) if each in library.places]
             else:
-                assert library is not None
-                places = library.places
-                for each in (name, name.rpartition("-")[0]):
-                    if each in places and (places[each][0] == TABLE) == tables:
-                        ref = self.refer(number, *places[each])
-                        if ref.instance_id == name:
-                            return ref
+                assert isinstance(settings, ProceduralSource)
+                known = index.isdecimal() and int(index) < settings.instances
+                places = [(category, int(index)) for category in ((TABLE,) if tables else CATEGORIES) if known]
+            for category, place in places:
+                if (category == TABLE) is tables and (ref := self.refer(number, category, place)).instance_id == name:
+                    return ref
         return None
 
     def libraries(self) -> "list[Library]":
@@ -181,8 +182,10 @@ class Catalogue:
         settings, library = self._sources(ref.category)[ref.source]
         if isinstance(settings, ProceduralSource):
             from workers.assets.builtin.make import make_asset
+            from workers.assets.recolour import recoloured
 
-            return make_asset(ref.category, settings, ref.index, self.assets.density_of(ref.category))
+            asset = make_asset(ref.category, settings, ref.index, self.assets.density_of(ref.category))
+            return asset if ref.category == TABLE else recoloured(asset, self.recolour)
         from workers.assets.library.shapes import load_shape
 
         assert library is not None
@@ -309,7 +312,7 @@ def choose_table(catalogue: Catalogue, rng: np.random.Generator) -> InstanceRef:
 
 def load_asset(catalogue: Catalogue, ref: InstanceRef) -> Asset:
     """The asset, from this process's cache if it is there; MeshError where its mesh is refused."""
-    key = (catalogue.digest, ref)
+    key = (catalogue.digest, catalogue.recolour, ref)
     if key in _cache:
         return _cache[key]
     asset, settings = catalogue.load(ref), catalogue.settings(ref)
@@ -327,7 +330,7 @@ def asset_bytes(asset: Asset) -> int:
     return total
 
 
-def open_cache(capacity_bytes: int) -> LRUCache[tuple[str, InstanceRef], Asset]:
+def open_cache(capacity_bytes: int) -> LRUCache[tuple[str, Recolour, InstanceRef], Asset]:
     """An LRU cache of assets. An asset larger than the capacity counts as the capacity, so that one is always kept."""
     return LRUCache(capacity_bytes, getsizeof=lambda asset: min(asset_bytes(asset), capacity_bytes))
 

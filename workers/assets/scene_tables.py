@@ -57,7 +57,8 @@ MOST_ROWS = 10_000
 class GivenObject:
     """An object of a table: its instance, or the category that one is drawn of, and `T_world_obj` [4, 4].
 
-    settle: whether it falls from there; sha256: of the shape that it had.
+    settle: whether it falls from there; sha256: of the shape that it had; of_source: whether the pose is that of the coordinates
+    of the shape's source, in metres.
     """
 
     instance_id: str | None
@@ -65,6 +66,7 @@ class GivenObject:
     T_world_obj: Pose
     settle: bool
     sha256: str | None
+    of_source: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +160,8 @@ def _object_of(row: Row) -> GivenObject | None:
         raise ValueError(f"instance_id is {instance_id!r} and category {category!r}: give one of them as text")
     if (settle := row.get("settle")) not in (None, False, True):
         raise ValueError(f"settle is {settle!r}, and must be true or false")
-    return GivenObject(instance_id, category, _pose_of(value, "T_world_obj"), bool(settle), row.get("sha256") or None)
+    T, sha256, of_source = _pose_of(value, "T_world_obj"), row.get("sha256") or None, bool(row.get("of_source"))
+    return GivenObject(instance_id, category, T, bool(settle), sha256, of_source)
 
 
 def _camera_of(row: Row) -> tuple[Pose, Intrinsics | None] | None:
@@ -169,11 +172,8 @@ def _camera_of(row: Row) -> tuple[Pose, Intrinsics | None] | None:
     if all(value is None for value in values.values()):
         return T, None
     for name, (least, most, whole) in BOUNDS.items():
-        if (
-            not isinstance(value := values[name], int | float)
-            or not least <= value <= most
-            or value != (int(value) if whole else value)
-        ):
+        value = values[name]
+        if not isinstance(value, int | float) or not least <= value <= most or (whole and value % 1):
             raise ValueError(f"{name} is {value}, and must be from {least:g} to {most:g}{', whole' * whole}")
     return T, Intrinsics.model_validate(values)
 

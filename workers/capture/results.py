@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from schemas.capture import CaptureListing, Reconstruction
 from schemas.errors import AssetSourceError, CaptureError, InputError, command_line
 from schemas.job.job import Job
+from schemas.job.look import RECOLOUR_VERSION
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
 from workers.assets.poses import open_poses
 from workers.assets.scene_tables import open_scenes
@@ -30,6 +31,9 @@ from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_O
 from workers.capture.truth import TRUTH
 from workers.door.meshes.ply import Element, encode_ply, parse_ply
 from workers.door.opening import as_refusal
+
+if TYPE_CHECKING:
+    from workers.assets.pictures import Pictures
 
 PROCESS_FILE, CLOUD_FILE, MESH_FILE, POSES_FILE = "process.json", "cloud.ply", "mesh.ply", "poses.parquet"
 
@@ -165,12 +169,24 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
 
     `watch` is told now and then how far it is. Raises AssetSourceError that names the key of a folder that cannot be used.
     """
-    catalogue = open_catalogue(job.assets, job_folder, tuple(job.categories), watch)
+    look, categories = job.drawn_look, {*job.categories, *((job.look.clutter and job.look.clutter.categories) or ())}
+    catalogue = open_catalogue(job.assets, job_folder, tuple(categories), watch)
     poses, scenes = open_poses(job, job_folder), open_scenes(job, job_folder)
-    if read := [*poses.values(), *([] if scenes is None else [scenes])]:
-        whole = "\n".join([catalogue.digest, *(file.sha256 for file in read)])
+    pictures: Pictures = {}
+    further = [file.sha256 for file in (*poses.values(), scenes) if file is not None]
+    if look.folders:
+        from workers.assets.pictures import open_pictures
+
+        pictures = open_pictures(look, job_folder)
+        further += [f"{key} {one.name} {one.sha256}" for key, some in pictures.items() for one in some]
+    if look.recolour != "as_made":
+        further.append(f"recolour {look.model_dump_json(include={'recolour'})} {RECOLOUR_VERSION}")
+    if further:
+        whole = "\n".join([catalogue.digest, *further])
         digest = hashlib.sha256(whole.encode()).hexdigest()
-        catalogue = replace(catalogue, poses=poses, scenes=scenes, digest=digest)
+        catalogue = replace(
+            catalogue, poses=poses, scenes=scenes, pictures=pictures, recolour=look.recolour, digest=digest
+        )
     if job.captures is None or not job.captures.folders:
         return catalogue
     listings, folders = [], job.captures.folders

@@ -234,6 +234,7 @@ def scene_row(
         "skipped": [dict(effect) for effect in origin.skipped],
         "raycast_checked": False,
         "settings_digest": context.settings_digest,
+        "surroundings": None,
         "capture": quality_columns(done, origin, shares, left_out),
     }
 

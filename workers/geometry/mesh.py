@@ -2,6 +2,7 @@
 
 import functools
 import os
+from collections.abc import Sequence
 
 import manifold3d
 import numpy as np
@@ -168,6 +169,13 @@ def piece_of(mesh: Mesh, faces: NDArray[np.integer]) -> Mesh:
     """These faces [F, 3] of a mesh, with the vertices that they have."""
     kept, inverse = np.unique(faces, return_inverse=True)
     return Mesh(mesh.vertices[kept], inverse.reshape(-1, 3).astype(np.int32))
+
+
+def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
+    """Meshes of one frame as one."""
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces + np.int32(begin) for mesh, begin in zip(meshes, first, strict=False)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
 
 
 def concavity_m(mesh: Mesh) -> float:

@@ -386,3 +386,12 @@ def is_inner(region: NDArray[np.uint8]) -> NDArray[np.bool_]:
     shown = (region > 0).astype(np.uint8)
     inner: NDArray = cv2.erode(shown, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return inner > 0
+
+
+def fill_image(picture: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """[height, width, 3]: the middle of a picture [h, w, 3], as large as fills the image."""
+    scale = max(width / picture.shape[1], height / picture.shape[0])
+    wide, high = max(width, round(scale * picture.shape[1])), max(height, round(scale * picture.shape[0]))
+    how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
+    left, top = (wide - width) // 2, (high - height) // 2
+    return np.asarray(cv2.resize(picture, (wide, high), interpolation=how), np.uint8)[top:, left:][:height, :width]

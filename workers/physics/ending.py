@@ -18,7 +18,7 @@ from workers.physics.placement import (
     TOUCHING_M,
     Placement,
     Support,
-    find_gaps_m,
+    find_overlaps_m,
     measure_supports,
     placed_mesh,
 )
@@ -152,34 +152,29 @@ def _settled(ending: Ending, T_world_obj: Pose, held: Support, support: Supporte
 
 
 def describe_kept(ending: Ending, most_mm: float) -> tuple[Settled, ...]:
-    """The figures of objects at poses that nothing led to, also where they hover.
+    """The figures of objects at poses that nothing led to.
 
-    An overlap is that with others, the table or the floor. A gap of `FARTHEST_M` or more is that below the object, straight
-    down. Raises SettleError where objects overlap by more than `most_mm`.
+    What touches nothing hovers by the way straight down to what is below it. What is no body, and near no surface, counts as its
+    hull in the table. Raises SettleError where one is deeper in another, in the table or in the floor than `most_mm`.
     """
-    drop, kept = ending.drop, list[Settled]()
-    meshes = [*(placed_mesh(start, T) for start, T in zip(drop.starts, ending.poses, strict=True)), drop.table.mesh]
+    starts, poses, forms = ending.drop.starts, (*ending.poses, np.eye(4)), ending.placement.forms
+    meshes = [*(placed_mesh(start, T) for start, T in zip(starts, poses, strict=False)), ending.drop.table.mesh]
+    names = [f"region {start.region_id} ({start.asset.instance_id})" for start in starts] + ["the table", "the floor"]
+    overlaps, kept, table = list(find_overlaps_m(forms, poses)), list[Settled](), len(starts)
     for number, held in enumerate(measure_supports(ending.placement, ending.poses)):
+        within = {i + j - number: depth_m for i, j, depth_m in overlaps if number in (i, j) and depth_m > 0.0}
+        sunk_m = within.get(table, 0.0) if held.gap_m >= FARTHEST_M and forms[table].solid is not None else 0.0
         lowest_m = float(meshes[number].vertices[:, 2].min())
-        gap_m = min(held.gap_m, lowest_m)
-        if held.gap_m >= FARTHEST_M:
-            others = [vertical_gap(meshes[number], mesh) for n, mesh in enumerate(meshes) if n != number]
-            gap_m = min(lowest_m, *(gap for gap in others if gap > 0.0), math.inf)
+        gap_m = min(-sunk_m if sunk_m else held.gap_m, lowest_m)
+        within[table + 1] = -lowest_m
+        if gap_m > TOUCHING_M:
+            below = [vertical_gap(meshes[number], mesh) for n, mesh in enumerate(meshes) if n != number]
+            gap_m = min(lowest_m, *(way for way in below if way > 0.0), math.inf)
         if gap_m < -most_mm / 1e3:
-            remedy = f"check.overlap_mm is {most_mm:g}: move it, or raise that"
-            raise _overlap(ending, number, gap_m, remedy, with_floor=gap_m == lowest_m)
+            where = f"{names[number]} is {-gap_m * 1e3:.2f} mm inside {names[max(within, key=within.__getitem__)]}"
+            raise SettleError("overlap", f"{where}, and check.overlap_mm is {most_mm:g}: move it, or raise that")
         kept.append(_settled(ending, ending.poses[number], replace(held, gap_m=gap_m), "kept"))
     return tuple(kept)
-
-
-def _overlap(ending: Ending, number: int, gap_m: float, remedy: str, with_floor: bool) -> SettleError:
-    """What the object of a number is in, and how deep."""
-    forms, poses = ending.placement.forms, (*ending.poses, np.eye(4))
-    names = [f"region {start.region_id} ({start.asset.instance_id})" for start in ending.drop.starts] + ["the table"]
-    others = [n for n in range(len(forms)) if n != number]
-    deepest = min(others, key=lambda n: find_gaps_m([forms[number], forms[n]], [poses[number], poses[n]])[0])
-    body = "the floor" if with_floor else names[deepest]
-    return SettleError("overlap", f"{names[number]} is {-gap_m * 1e3:.2f} mm inside {body}, and {remedy}")
 
 
 def _support_of(ending: Ending) -> SupportedBy:

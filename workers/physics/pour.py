@@ -6,11 +6,12 @@ A pile of many falls in waves, each above what lies by then: from the height of 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import count
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import SettleError
 from schemas.scene.scene import ObjectStart, Table
-from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.shape import REGION_FIRST_CLUTTER, REGION_FIRST_OBJECT
 from workers.geometry.frames import transform, translation
 from workers.physics.support import support_height
 
@@ -86,5 +87,6 @@ def _top_m(start: ObjectStart, others: Sequence[ObjectStart], table: Table) -> f
 
 
 def renumbered(starts: Sequence[ObjectStart]) -> tuple[ObjectStart, ...]:
-    """The objects with region ids one after another."""
-    return tuple(dataclasses.replace(one, region_id=REGION_FIRST_OBJECT + n) for n, one in enumerate(starts))
+    """The objects with region ids one after another, and likewise the clutter."""
+    next_id = {False: count(REGION_FIRST_OBJECT), True: count(REGION_FIRST_CLUTTER)}
+    return tuple(dataclasses.replace(one, region_id=next(next_id[one.is_clutter])) for one in starts)

@@ -17,7 +17,8 @@ from schemas.errors import SettleError
 from schemas.job.physics import Physics
 from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled
 from workers.geometry.frames import translation
-from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for_with, rooms_m
+from workers.geometry.mesh import join_meshes
+from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for, called_for_with, rooms_m
 from workers.physics.ending import Ending, UnsupportedError, describe, describe_kept, require_calm
 from workers.physics.fall import Outcome
 from workers.physics.hold import RELEASE_RATE, hold, land, moved_by, release_again
@@ -114,7 +115,7 @@ def _without_lost(drop: Drop, lost: LostError, again: dict[int, int]) -> Drop:
     """
     pouring, starts = drop.pouring, list(moved_to(drop.starts, lost.poses))
     kept = [number for number in range(len(starts)) if number not in lost.numbers]
-    if pouring.remove and kept and lost.reason != "thrown":
+    if pouring.remove and not all(starts[number].is_clutter for number in kept) and lost.reason != "thrown":
         lying, ready = (frozenset(kept.index(n) for n in kept if n in some) for some in (lost.fallen, drop.ready))
         clear_m = tuple(drop.clearances_m[number] for number in kept) if drop.clearances_m else ()
         fewer = renumbered([starts[number] for number in kept])
@@ -319,7 +320,7 @@ def _settle_alone(
         except LostError as lost:
             if pouring.draw is not None and not alone:
                 raise LeftRoomError from None  # a new start has another room
-            if not pouring.remove or (start is plan.objects[-1] and not began) or lost.reason == "thrown":
+            if not pouring.remove or (start is plan.shown[-1] and not began) or lost.reason == "thrown":
                 raise
             continue
         began += starts
@@ -328,12 +329,30 @@ def _settle_alone(
 
 
 def keep_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan, most_mm: float) -> Rest:
-    """The scene's objects where they were put, measured there: they need not rest. Raises as `describe_kept`."""
-    drop, poses = Drop(plan.objects, plan.table, physics, effects), tuple(start.T_world_obj for start in plan.objects)
+    """The scene's objects where they were put, measured there: they need not rest. Clutter falls on them and on their table.
+
+    Raises as `describe_kept`; clutter that finds no rest is left out.
+    """
+    drop = Drop(plan.shown, plan.table, physics, effects)
+    poses = tuple(start.T_world_obj for start in drop.starts)
     for start in drop.starts:
         require_near_origin(start)
     placement = _place(drop, poses, forms_of(drop.starts))
-    return Rest(drop.starts, describe_kept(Ending(drop, placement, poses), most_mm))
+    kept, clutter = describe_kept(Ending(drop, placement, poses), most_mm), plan.objects[len(poses) :]
+    if clutter and plan.ground is not None:
+        meshes = [drop.table.mesh, *map(placed_mesh, drop.starts, poses)]
+        table = dataclasses.replace(
+            drop.table, mesh=join_meshes(meshes), top=dataclasses.replace(drop.table.top, convex=False)
+        )
+        called = called_for(clutter, table, physics)
+        ground = dataclasses.replace(plan.ground, table=table)
+        with suppress(SettleError):
+            over = dataclasses.replace(plan, objects=clutter, ground=ground)
+            rest = settle_scene(over, physics, add_effects(effects, called))
+            return Rest(
+                (*drop.starts, *rest.starts), (*kept, *rest.settled), dict.fromkeys(sorted(called), "clutter falls")
+            )
+    return Rest(drop.starts, kept)
 
 
 RECHECK_S = 1.0

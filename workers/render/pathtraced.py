@@ -44,6 +44,7 @@ from schemas.scene.view import Camera, GBuffer, Intrinsics
 from workers.geometry.camera import NEAR_M
 from workers.geometry.colour import HOLE_ALPHA, SRGB_STEPS, decode_srgb, encode_codes, has_holes
 from workers.geometry.frames import transform
+from workers.geometry.pixels import fill_image
 from workers.render.raster.baking import LAMP_RAD
 from workers.render.raster.batches import MATTE_ROUGHNESS, texture_of
 from workers.render.raster.gbuffer import Renderer
@@ -318,7 +319,7 @@ class Tracer:
         image = self._mi.render(built.scene, spp=round_up_samples(render.path_samples), **traced)
         pixels = np.array(image, np.float64)
         covered = np.clip(pixels[..., 3:], 0.0, 1.0)
-        light = pixels[..., :3] + (1.0 - covered) * np.array(appearance.background)
+        light = pixels[..., :3] + (1.0 - covered) * _behind(appearance, *covered.shape[:2])
         return average(light, camera.intrinsics)
 
     def build(self, things: Sequence[Placed], appearance: Appearance, effects: EffectPlan) -> TracedScene:
@@ -359,6 +360,13 @@ class Tracer:
                 "sampler": {"type": "multijitter"},
             }
         )
+
+
+def _behind(appearance: Appearance, height: int, width: int) -> Array:
+    """[3] or [height, width, 3] linear light where nothing is."""
+    if appearance.backdrop is None:
+        return np.array(appearance.background)
+    return np.asarray(SRGB_STEPS[fill_image(appearance.backdrop, width, height)], np.float64)
 
 
 @cache

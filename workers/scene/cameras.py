@@ -188,7 +188,9 @@ def place_more(
             stands = ((T_world @ T, own or others) for T, own in rows)
             named = (NamedCamera(entry.name, n, Camera(k, frozen_array(T))) for n, (T, k) in enumerate(stands))
         for each in named:
-            _require_room(each.name, each.number, each.camera.position, plan, poses, by_table=entry.poses is not None)
+            _require_room(
+                each.name, each.number, each.camera.position, plan, poses, IN_TABLE if entry.poses else ON_ORBIT
+            )
             if entry.poses is None:
                 require_depth(job, each, points)
             yield each
@@ -386,15 +388,20 @@ def _radical_inverse(number: int) -> float:
 def require_aimed(plan: ScenePlan, poses: Sequence[Pose]) -> None:
     """Raises ViewError where an input camera of a table of scenes stands below the floor, or inside of something."""
     for number, camera in enumerate(plan.input_cameras):
-        _require_room("input", number, camera.position, plan, poses, by_table=True)
+        _require_room("input", number, camera.position, plan, poses, IN_TABLE)
+
+
+ON_ORBIT, IN_TABLE = (
+    ("raise its inclination, or its about", "take a larger radius_m, or fit"),
+    ("move it in its table",) * 2,
+)
+"""What moves a camera up, and away from what it is in."""
 
 
 def _require_room(
-    name: str, number: int, position: Array, plan: ScenePlan, poses: Sequence[Pose], by_table: bool = False
+    name: str, number: int, position: Array, plan: ScenePlan, poses: Sequence[Pose], moves: tuple[str, str]
 ) -> None:
     """Raises ViewError where a camera stands below the floor, or inside of an object or of the table."""
-    moves = "raise its inclination, or its about", "take a larger radius_m, or fit"
-    moves = ("move it in its table",) * 2 if by_table else moves
     where = f"camera {name}, number {number}, at ({', '.join(f'{x:.3f}' for x in position)}) m"
     if plan.ground is not None and position[2] <= 0.0:
         raise ViewError("camera_in_scene", f"{where} is below the floor: {moves[0]}")

@@ -160,6 +160,7 @@ def _check_images(view: View, scene: Row) -> Iterator[str]:
     """
     assert view.region is not None
     where, known = _named(view), {0, 1} | {label.region_id for label in view.labels}
+    known |= {body["region_id"] for body in (scene["surroundings"] or {}).get("clutter", ())}
     if foreign := set(np.unique(view.region).tolist()) - known:
         yield f"{where}: the mask has regions {sorted(foreign)} that objects lacks"
     if not _is_captured(scene) and (view.depth[view.region == 0] != 0).any():

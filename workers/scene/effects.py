@@ -16,6 +16,7 @@ from schemas.base import Array
 from schemas.dataset.layout import SWITCHES, PixelKind, is_stored
 from schemas.job.captures import Simulate
 from schemas.job.job import Check, Job
+from schemas.job.look import OF_COLOUR, Look
 from schemas.job.views import SensorEffects, Tier, ViewTarget
 from schemas.scene.scene import EffectKind, EffectPlan, ScenePlan
 from schemas.scene.shape import Part
@@ -72,6 +73,7 @@ def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPl
     unasked |= {"further_views"} if not facts.job.cameras.more and not _is_studio(facts) else set()
     unasked |= {"alpha"} if not _is_studio(facts) else set()
     unasked |= {"kept_poses"} if facts.job.scenes_from is None else set()
+    unasked |= set(BRANCHES) if all(_is_usual(facts, name) for name in BRANCHES) else set()
     return _plan({name: why for name, why in reasons.items() if name not in unasked}, forced)
 
 
@@ -164,6 +166,27 @@ def _tier(*tiers: Tier) -> Reason:
     return _first_of(_stored("rgb"), skipped_because)
 
 
+def _is_usual(facts: Facts, name: str) -> bool:
+    """Whether the job leaves a branch of `look` as it is unless asked for."""
+    return bool(getattr(facts.job.look, BRANCHES[name]) == Look.model_fields[BRANCHES[name]].default)
+
+
+def _look(name: str) -> Reason:
+    """A branch of `look`, which runs in every scene where the job asks for it."""
+    usual = Look.model_fields[BRANCHES[name]].default or "off"
+    return _where(lambda facts: not _is_usual(facts, name), f"look.{BRANCHES[name]} is {usual}")
+
+
+BRANCHES = {
+    "recolour": "recolour",
+    "floor_cover": "floor",
+    "table_cover": "table",
+    "backdrop": "background",
+    "room": "room",
+    "clutter": "clutter",
+}
+"""Effects of surroundings, and the branch of `look` that asks for each."""
+
 _NOT_TRACED = _where(lambda facts: facts.job.render.tier != "pathtraced", "part of global_illumination")
 """Traced paths are shadowed, and spread over a pixel, in any case: nothing of that can be left out."""
 
@@ -190,8 +213,11 @@ _ALPHA = _first_of(
 
 def _parts(facts: Facts) -> Iterator[Part]:
     plan = facts.plan
-    ground = () if plan.ground is None else (plan.floor, plan.table.asset.shape)
-    for shape in (*ground, *(start.asset.shape for start in plan.objects)):
+    shapes = [start.asset.shape for start in plan.objects]
+    if (ground := plan.ground) is not None:
+        shapes += [ground.floor, ground.cover or ground.table.asset.shape]
+        shapes += [] if ground.walls is None else [ground.walls.shape]
+    for shape in shapes:
         yield from shape.parts
 
 
@@ -209,7 +235,8 @@ _GLASS = _where(lambda facts: any(part.material.transmission > 0.0 for part in _
 
 
 def _floor(facts: Facts) -> str | None:
-    return _outside(facts, facts.plan.floor.vertices)
+    walled = facts.plan.ground is not None and facts.plan.ground.walls is not None  # walls are of the floor's region
+    return None if walled else _outside(facts, facts.plan.floor.vertices)
 
 
 def _table(facts: Facts) -> str | None:
@@ -277,6 +304,18 @@ PHYSICS_EFFECTS: tuple[Effect, ...] = tuple(_of_physics(name) for name in PREDIC
 CAPTURE_EFFECTS: tuple[str, ...] = tuple(name for name, key in Simulate.model_fields.items() if key.default is None)
 """The branches of `captures.simulate` that are off unless asked for: each switches an effect of its name on."""
 
+_FITS = _where(lambda facts: len(facts.plan.shown) < len(facts.plan.objects), "none of it found room")
+
+
+def _surroundings(name: str, branch: str) -> Effect:
+    """The effect of a branch of `look`."""
+    further = {"clutter": (_FITS,), **dict.fromkeys(OF_COLOUR, (_tier("raster", "pathtraced"),))}.get(branch, ())
+    return Effect(name, "asked", _first_of(_look(name), *further), "plan")
+
+
+LOOK_EFFECTS: tuple[Effect, ...] = tuple(_surroundings(name, branch) for name, branch in BRANCHES.items())
+"""Surroundings. A receipt names them where the job asks for any."""
+
 TABLE: tuple[Effect, ...] = (
     *PHYSICS_EFFECTS,
     *(Effect(name, "asked", None, "physics") for name in ONLY_LATE),
@@ -310,6 +349,7 @@ TABLE: tuple[Effect, ...] = (
     Effect("release_again", "asked", _in_motion("nothing rests", _RAYCAST), "recheck"),
     Effect("further_views", "asked", _where(lambda facts: facts.job.cameras.more, "cameras.more is empty"), "render"),
     Effect("alpha", "asked", _ALPHA, "targets"),
+    *LOOK_EFFECTS,
     Effect("floor", "no_op", _on_ground("there is no floor", _floor), "render", _always),
     Effect("table", "no_op", _on_ground("there is no table", _table), "render", _always),
     Effect("textures", "no_op", _first_of(_stored("rgb"), _TEXTURES), "render", _always),

@@ -10,7 +10,8 @@ from schemas.scene.scene import ObjectStart, ScenePlan
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
 from schemas.scene.view import Camera, Intrinsics
 from workers.assets.catalogue import Catalogue, InstanceRef, choose_object, choose_table
-from workers.assets.scene_tables import GivenObject, GivenScene, read_scene
+from workers.assets.scene_tables import GivenScene, read_scene
+from workers.geometry.frames import invert
 from workers.geometry.hull import hull_of
 from workers.scene.chance import SceneChance, Stream
 
@@ -22,29 +23,30 @@ def read_given(catalogue: Catalogue, scene_id: int) -> GivenScene | None:
 
 def choose_given(catalogue: Catalogue, chance: SceneChance, given: GivenScene) -> tuple[list[InstanceRef], InstanceRef]:
     """The instances of the objects, in order, and of the table; what has none is drawn. Raises StartError."""
-    objects = [_choose(catalogue, chance, number, each) for number, each in enumerate(given.objects)]
+    objects = list[InstanceRef]()
+    for number, each in enumerate(given.objects):
+        where, category = f"object {number} of scene {chance.scene_id}", each.category
+        if each.instance_id is not None:
+            objects.append(_find(catalogue, each.instance_id, where))
+            if category not in (None, (known := objects[-1].category)):
+                raise StartError(
+                    "unknown_instance", f"{where}: {each.instance_id} is a {known}, and category is {category!r}"
+                )
+        elif catalogue.offers(str(category)):
+            objects.append(choose_object(catalogue, str(category), chance.object_stream(Stream.GIVEN, number)))
+        else:
+            raise StartError(
+                "unknown_category", f"{where}: no source in assets.objects offers {category!r}: add one, or rename it"
+            )
     if given.table_id is None:
         return objects, choose_table(catalogue, chance.stream(Stream.TABLE))
-    if (table := catalogue.find(given.table_id, tables=True)) is None:
-        raise StartError(
-            "unknown_instance", f"no source in assets.tables has {given.table_id}: add the one that it is of"
-        )
-    return objects, table
+    return objects, _find(catalogue, given.table_id, f"scene {chance.scene_id}", tables=True)
 
 
-def _choose(catalogue: Catalogue, chance: SceneChance, number: int, each: GivenObject) -> InstanceRef:
-    where, category = f"object {number} of scene {chance.scene_id}", each.category
-    sources = "no source in assets.objects"
-    if each.instance_id is None:
-        if not catalogue.offers(str(category)):
-            raise StartError("unknown_category", f"{where}: {sources} offers {category!r}: add one, or rename it")
-        return choose_object(catalogue, str(category), chance.object_stream(Stream.GIVEN, number))
-    name = each.instance_id
-    if (ref := catalogue.find(name)) is None:
-        remedy = "add its own, with its seed and instances"
-        raise StartError("unknown_instance", f"{where}: {sources} has {name!r}: {remedy}")
-    if category not in (None, ref.category):
-        raise StartError("unknown_instance", f"{where}: {name} is a {ref.category}, and category is {category!r}")
+def _find(catalogue: Catalogue, name: str, where: str, tables: bool = False) -> InstanceRef:
+    if (ref := catalogue.find(name, tables)) is None:
+        sources = f"no source in assets.{'tables' if tables else 'objects'} has {name!r}"
+        raise StartError("unknown_instance", f"{where}: {sources}: add its own, with its seed and instances")
     return ref
 
 
@@ -55,16 +57,14 @@ def put_given(plan: ScenePlan, job: Job, given: GivenScene, assets: Sequence[Ass
         raise StartError(
             "settle_some", f"objects {falls} have settle: true, and others do not: give all of a scene the same"
         )
-    kept = not given.objects[0].settle
-    for each, asset in zip(given.objects, assets, strict=True):
+    kept, starts = not given.objects[0].settle, list[ObjectStart]()
+    for number, (each, asset) in enumerate(zip(given.objects, assets, strict=True), start=REGION_FIRST_OBJECT):
         if each.sha256 not in (None, asset.sha256):
             shapes = f"{asset.instance_id} has the SHA-256 {asset.sha256[:12]}, and had {str(each.sha256)[:12]}"
             raise StartError("other_shape", f"{shapes}: its source, or Verso, is of another version: use that one")
-    starts = tuple(
-        ObjectStart(asset, hull_of(asset.shape), REGION_FIRST_OBJECT + number, frozen_array(each.T_world_obj), 0, kept)
-        for number, (each, asset) in enumerate(zip(given.objects, assets, strict=True))
-    )
-    plan = replace(plan, category=assets[0].category, objects=starts, kept=kept)
+        T = each.T_world_obj @ invert(asset.T_source_to_object) if each.of_source else each.T_world_obj
+        starts.append(ObjectStart(asset, hull_of(asset.shape), number, frozen_array(T), 0, kept))
+    plan = replace(plan, category=assets[0].category, objects=tuple(starts), kept=kept)
     if job.cameras.orbit.always or not given.cameras:
         return plan
     if len(given.cameras) < job.pairs_per_scene:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from schemas.job.views import Distortion, Images, Patch
 from schemas.scene.scene import EffectPlan, Placed, PosedScene, ScenePlan
-from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE
+from schemas.scene.shape import REGION_TABLE, is_object
 from schemas.scene.view import Agreement, Camera, Intrinsics, ObjectLabel, View, crop_box
 from workers.geometry.camera import image_coordinates
 from workers.geometry.frames import invert
@@ -36,7 +36,7 @@ def label_regions(
 ) -> tuple[ObjectLabel, ...]:
     """Labels of the table and of every object in a mask [H, W], in order of region id."""
     names = {} if plan.ground is None else {REGION_TABLE: ("table", plan.table.asset.instance_id)}
-    names.update({start.region_id: (start.asset.category, start.asset.instance_id) for start in plan.objects})
+    names.update({start.region_id: (start.asset.category, start.asset.instance_id) for start in plan.shown})
     things = [thing for thing in posed.things if thing.region_id in names]
     return label_things(things, names, camera, region, count_unoccluded)
 
@@ -161,11 +161,11 @@ def compare_views(source: View, mirror: View, images: Images, bound_mm: float) -
     assert source.region is not None and mirror.region is not None
     bounds = Bounds(FACING, (SMOOTH_INPUT_M, SMOOTH_MIRROR_M), HIDDEN_M)
     here, there = Seen(source.depth, source.region, source.camera), Seen(mirror.depth, mirror.region, mirror.camera)
-    chosen = source.region >= REGION_FIRST_OBJECT
+    chosen = is_object(source.region)
     chosen[::SCENE_STRIDE, ::SCENE_STRIDE] = True
     difference_m, regions = compare_covisible(here, there, np.flatnonzero(chosen), bounds, images.depth_units_per_m)
     difference_mm = difference_m * 1e3
-    object_mm = difference_mm[regions >= REGION_FIRST_OBJECT]
+    object_mm = difference_mm[is_object(regions)]
     enough = len(object_mm) >= FEWEST_POINTS
     return Agreement(
         median_mm=float(np.median(object_mm)) if enough else None,

@@ -20,6 +20,7 @@ from workers.scene.pairs import SettledScene, make_further, make_pair
 from workers.scene.plan import plan_scene, pouring_of
 from workers.scene.ray_check import check_pair
 from workers.scene.studio import stand_alone
+from workers.scene.surround import look_without, surround
 from workers.stopwatch import Stopwatch
 
 
@@ -71,8 +72,11 @@ def make_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> S
 def plan_with_effects(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> tuple[ScenePlan, EffectPlan]:
     """What chance decides, and the effects that it calls for. Raises SceneError."""
     job, chance = context.job, SceneChance(context.job.seed, scene_id)
+    look = look_without(job.drawn_look, context.withdrawn)
     with stopwatch.stage("assets"):
-        plan = plan_scene(job, context.catalogue, chance)
+        catalogue = replace(context.catalogue, recolour=look.recolour)
+        plan = plan_scene(job, catalogue, chance)
+        plan = surround(job, look, catalogue, chance, plan)
     with stopwatch.stage("plan"):
         facts = Facts(job, plan, is_raycast_scene(job.check, chance))
         return plan, plan_effects(facts, context.forced).without(*context.withdrawn)
@@ -101,13 +105,14 @@ def lay_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> La
 
 def place_cameras(context: WorkerContext, plan: ScenePlan, rest: Rest) -> ScenePlan:
     """The plan with the cameras that follow from where its objects rest. Raises ViewError."""
-    poses = [each.T_world_obj for each in rest.settled]
+    shown = replace(plan, objects=plan.shown)
+    poses = [each.T_world_obj for each in rest.settled[: len(shown.objects)]]
     if plan.aimed:
-        require_aimed(plan, poses)
-    else:
-        plan = frame_cameras(context.job, plan, poses)
+        require_aimed(shown, poses)
+    framed = shown if plan.aimed else frame_cameras(context.job, shown, poses)
     chance = SceneChance(context.job.seed, plan.scene_id)
-    return replace(plan, more=tuple(place_more(context.job, chance, plan, poses, context.catalogue.poses)))
+    more = tuple(place_more(context.job, chance, framed, poses, context.catalogue.poses))
+    return replace(framed, objects=plan.objects, more=more)
 
 
 def render_scene(context: WorkerContext, laid: Laid, stopwatch: Stopwatch) -> Scene:
@@ -133,6 +138,8 @@ def pose_scene(plan: ScenePlan, settled: Sequence[Settled]) -> PosedScene:
     )
     things = objects
     if plan.ground is not None:
-        table = Placed(REGION_TABLE, plan.table.asset.shape, plan.table.T_world_table)
-        things = (Placed(REGION_FLOOR, plan.floor, frozen_array(np.eye(4))), table, *objects)
+        ground, still = plan.ground, frozen_array(np.eye(4))
+        table = Placed(REGION_TABLE, ground.cover or plan.table.asset.shape, plan.table.T_world_table)
+        walls = () if ground.walls is None else (Placed(REGION_FLOOR, ground.walls.shape, still),)
+        things = (Placed(REGION_FLOOR, plan.floor, still), *walls, table, *objects)
     return PosedScene(things, plan.appearance)

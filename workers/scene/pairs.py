@@ -14,8 +14,9 @@ from schemas.errors import ViewError
 from schemas.job.cameras import Mirror
 from schemas.job.views import Images
 from schemas.scene.scene import EffectPlan, PosedScene, ScenePlan
-from schemas.scene.shape import REGION_FIRST_OBJECT
+from schemas.scene.shape import is_object
 from schemas.scene.view import ROLES, VIEW_ROLES, Camera, Pair, Role, View
+from workers.assets.surroundings import require_camera_inside
 from workers.geometry.pixels import dequantise_depth, quantise_depth
 from workers.render.pathtraced import draw_view
 from workers.scene.cameras import draw_mirror_share, place_beside, place_fixed, place_mirror_camera
@@ -31,7 +32,7 @@ from workers.targets.targets import Sight, draw_targets
 
 def object_distance(depth: NDArray[np.uint16], region: NDArray[np.uint8], images: Images, mirror: Mirror) -> float:
     """`front_distance` of the object in a stored view; converts only the object's pixels to metres."""
-    return front_distance(dequantise_depth(depth[region >= REGION_FIRST_OBJECT], images), np.True_, mirror)
+    return front_distance(dequantise_depth(depth[is_object(region)], images), np.True_, mirror)
 
 
 def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, mirror: Mirror) -> float:
@@ -117,6 +118,8 @@ def render_view(
     `sight`: what the pair's input camera sees, for the views of others; `number`: of a view of a named camera.
     """
     job, renderer, stopwatch = scene.context.job, scene.context.renderer, scene.stopwatch
+    if scene.plan.ground is not None:
+        require_camera_inside(scene.plan.ground.walls, role, camera)
     parent_id = input_pose_id(scene.plan.scene_id, pair, job.pairs_per_scene)
     pose_id = file_pose_id(role, parent_id)
     with stopwatch.stage("render"):

@@ -4,8 +4,10 @@ Each step has a named stream of random numbers. Several objects begin each on a 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -13,9 +15,10 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.errors import StartError
 from schemas.job.assets import SPLITS
 from schemas.job.job import Job
+from schemas.job.look import Clutter
 from schemas.job.physics import Start
 from schemas.scene.scene import Ground, ObjectStart, ScenePlan, Table
-from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Hull, Mesh
+from schemas.scene.shape import REGION_FIRST_CLUTTER, REGION_FIRST_OBJECT, Asset, Hull, Mesh
 from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import Catalogue, InstanceRef, choose_object, choose_table, load_asset
 from workers.assets.scene_tables import GivenScene
@@ -62,12 +65,12 @@ def choose_assets(job: Job, catalogue: Catalogue, chance: SceneChance) -> tuple[
     fit = {*SPLITS}
     for number in range(count_objects(job, chance)):
         categories, instances = (chance.object_stream(name, number) for name in (Stream.CATEGORY, Stream.OBJECT))
-        category = _draw_category(job, categories)
+        category = draw_category(job.categories, categories)
         for _ in range(MOST_DRAWS):
             ref = choose_object(catalogue, category, instances)
             if not split.named or split.of(ref.instance_id) in fit:
                 break
-            category = _draw_category(job, categories) if number else category
+            category = draw_category(job.categories, categories) if number else category
         else:
             wanted = f"none of {MOST_DRAWS} instances that were drawn, the last of {category}, is of {', '.join(sorted(fit))}"
             raise StartError("no_split", f"{wanted}: name more instances in assets.split.named")
@@ -85,13 +88,13 @@ def count_objects(job: Job, chance: SceneChance) -> int:
 
 def choose_category(job: Job, chance: SceneChance, number: int = 0) -> str:
     """The category that is drawn for an object by its number; the first one's is the scene's."""
-    return _draw_category(job, chance.object_stream(Stream.CATEGORY, number))
+    return draw_category(job.categories, chance.object_stream(Stream.CATEGORY, number))
 
 
-def _draw_category(job: Job, rng: np.random.Generator) -> str:
-    """A category by the job's weights."""
-    names = sorted(job.categories)
-    weights = np.array([job.categories[name] for name in names])
+def draw_category(categories: Mapping[str, float], rng: np.random.Generator) -> str:
+    """A category by its weight."""
+    names = sorted(categories)
+    weights = np.array([categories[name] for name in names])
     edges = np.cumsum(weights) / weights.sum()
     return names[min(int(np.searchsorted(edges, rng.random(), side="right")), len(names) - 1)]
 
@@ -116,6 +119,29 @@ def draw_scene(
         appearance=appearance,
     )
     return plan if given is None else put_given(plan, job, given, assets)
+
+
+def add_clutter(job: Job, clutter: Clutter, catalogue: Catalogue, chance: SceneChance, plan: ScenePlan) -> ScenePlan:
+    """The plan with clutter after its objects; what finds no room, or no instance of their split, is left out.
+
+    Each piece has a stream of its own, so that no object and no other piece follows from how many there are.
+    """
+    split, (low, high), objects = job.assets.split, clutter.count, plan.objects
+    weights = clutter.categories or job.categories
+    of = split.of(objects[0].asset.instance_id)
+    for number in range(int(chance.stream(Stream.CLUTTER).integers(low, high + 1))):
+        rng = chance.stream(Stream.CLUTTER, number)
+        drawn = (choose_object(catalogue, draw_category(weights, rng), rng) for _ in range(MOST_DRAWS))
+        ref = next((ref for ref in drawn if not split.named or split.of(ref.instance_id) == of), None)
+        if ref is None:
+            continue
+        asset, others = load_asset(catalogue, ref), [points_of(start) for start in objects]
+        region = REGION_FIRST_CLUTTER + sum(start.is_clutter for start in objects)
+        middle = objects[0].T_world_obj[:2, 3] if job.start.arrange == "pile" else np.zeros(2)
+        with suppress(StartError):
+            named = asset, region - REGION_FIRST_OBJECT
+            objects += (_find_place(job.start, (rng, partial(_same, rng)), named, plan.table, others, middle),)
+    return replace(plan, objects=objects)
 
 
 def draw_start(
@@ -151,6 +177,10 @@ def pouring_of(spec: Start, chance: SceneChance, plan: ScenePlan) -> Pouring:
         return replace(again, redraws=start.redraws + again.redraws + 1)
 
     return Pouring(piled, draw if spec.if_lost == "redraw" else None, MOST_REDRAWS, spec.if_lost == "remove")
+
+
+def _same(rng: np.random.Generator) -> np.random.Generator:
+    return rng
 
 
 Streams = tuple[np.random.Generator, Callable[[], np.random.Generator]]

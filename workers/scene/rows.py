@@ -93,7 +93,9 @@ def record_scene(context: WorkerContext, scene: Scene, watch: Stopwatch) -> Scen
         assets = list({asset.instance_id: asset for asset in every}.values())
         files += [shape_file(asset) for asset in assets if asset.shareable]
     # Of objects alone: a table takes as long and as much room, and no network is trained to complete it.
-    sampled = [NO_SAMPLES] * len(table) + [*sample_assets(assets[len(table) :], context.job.targets, watch)]
+    end = len(table) + len({start.asset.instance_id for start in scene.plan.shown})
+    sampled = sample_assets(assets[len(table) : end], context.job.targets, watch)
+    sampled = [*[NO_SAMPLES] * len(table), *sampled, *[NO_SAMPLES] * (len(assets) - end)]
     files += [samples.file for samples in sampled if samples.file is not None]
     rows = {
         "scenes": [scene_row(context, scene)],
@@ -166,13 +168,33 @@ def file_columns(file: EncodedFile) -> Row:
     return {"path": file.path, "bytes": len(file.data), "sha256": file.sha256}
 
 
+SURROUNDINGS = ("floor", "floor_tile_m", "table", "table_tile_m", "background", "room_m")
+
+
+def surroundings_column(scene: Scene, job: Job) -> Row | None:
+    """What was drawn of the surroundings; None where the job asks for none."""
+    if scene.plan.surroundings is None:
+        return None
+    clutter = [
+        {
+            "region_id": start.region_id,
+            "category": start.asset.category,
+            "instance_id": start.asset.instance_id,
+            "T_world_obj": matrix_column(rest.T_world_obj),
+        }
+        for start, rest in zip(scene.plan.objects, scene.settled, strict=True)
+        if start.is_clutter
+    ]
+    return {**dict.fromkeys(SURROUNDINGS), **scene.plan.surroundings, "clutter": clutter}
+
+
 def scene_row(context: WorkerContext, scene: Scene) -> Row:
     """The row of `scenes`: names of the first object, and the worst figures of all objects."""
     ran, skipped = write_receipt(scene.effects, scene.called)
     table = None if scene.plan.ground is None else scene.plan.table
     friction_of = context.job.physics.friction_of if table and context.job.physics.varies else lambda _: None
-    both = zip(scene.plan.objects, scene.settled, strict=True)
-    bodies = [body_columns(start, rest, friction_of(start.asset.category)) for start, rest in both]
+    posed = [both for both in zip(scene.plan.objects, scene.settled, strict=True) if not both[0].is_clutter]
+    bodies = [body_columns(start, rest, friction_of(start.asset.category)) for start, rest in posed]
     return {
         "scene_id": scene.plan.scene_id,
         "table_id": None if table is None else table.asset.instance_id,
@@ -185,6 +207,7 @@ def scene_row(context: WorkerContext, scene: Scene) -> Row:
         "raycast_checked": scene.raycast_checked,
         "settings_digest": context.settings_digest,
         "bodies": bodies,
+        "surroundings": surroundings_column(scene, context.job),
         "capture": None,
     }
 

@@ -5,6 +5,7 @@ there is not is 0. Coordinates and normals are 16-bit: `value / 65535` is the st
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -14,7 +15,7 @@ from schemas.base import Array
 from schemas.job.job import Job
 from schemas.job.views import Images, Targets
 from schemas.scene.scene import EffectPlan, Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT, Material, Mesh, Part, Shape
+from schemas.scene.shape import REGION_FLOOR, Material, Mesh, Part, Shape, is_object
 from schemas.scene.view import FULL, LAYERS, MODALITIES, Camera, PixelKind
 from workers.geometry.camera import NEAR_M, project, unproject
 from workers.geometry.colour import SRGB_STEPS, decode_srgb
@@ -62,7 +63,8 @@ def draw_targets(
     `sight`: what the pair's input camera sees; None for the input view itself.
     """
     drawn: dict[PixelKind, NDArray] = {}
-    objects = [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
+    things = _with_one_floor(things)
+    objects = [thing for thing in things if is_object(thing.region_id)]
     of_seen = [name for name in OF_NEAREST if effects.runs(name) and (sight or MODALITIES[name].of_input)]
     if of_seen:
         with watch.stage("targets"):
@@ -85,6 +87,15 @@ def draw_targets(
             with watch.stage("targets", "layers"):
                 drawn |= peel_layers(triangles, surfaces, job.targets.layers, job.images)
     return drawn
+
+
+def _with_one_floor(things: Sequence[Placed]) -> Sequence[Placed]:
+    """The things with the floor and the walls, which have one region, as one."""
+    floors = [thing for thing in things if thing.region_id == REGION_FLOOR]
+    if len(floors) < 2:
+        return things
+    whole = Shape(tuple(part for thing in floors for part in thing.shape.parts))
+    return [replace(floors[0], shape=whole), *(thing for thing in things if thing.region_id != REGION_FLOOR)]
 
 
 class Seen:
@@ -137,7 +148,7 @@ def draw_coordinates(seen: Seen, targets: Targets) -> NDArray[np.uint16]:
     """[H, W, 3]: where on its object each pixel is: the middle of the object's box at 0.5, the box's diagonal as 1 (NOCS)."""
     image = np.zeros((*seen.face.shape, 3), np.uint16)
     for thing in seen.things:
-        if thing.region_id >= REGION_FIRST_OBJECT:
+        if is_object(thing.region_id):
             T_obj_cam = invert(thing.T_world_shape) @ seen.camera.T_world_cam
             place = np.ascontiguousarray(T_obj_cam), seen.triangles.k, *coordinate_scale(thing.shape)
             paint_points((seen.face, seen.z), seen.triangles.region, np.uint8(thing.region_id), *place, image)
@@ -247,7 +258,7 @@ def draw_covisible(seen: Seen, targets: Targets) -> NDArray[np.uint8]:
     sight = seen.sight
     assert sight is not None
     image, k = np.zeros(seen.face.shape, np.uint8), sight.camera.intrinsics
-    pixels = np.flatnonzero(np.append(seen.triangles.region, np.uint8(0))[seen.face] >= REGION_FIRST_OBJECT)
+    pixels = np.flatnonzero(is_object(np.append(seen.triangles.region, np.uint8(0))[seen.face]))
     T_here_there = invert(seen.camera.T_world_cam) @ sight.camera.T_world_cam
     normals, offsets = (plane[seen.face.reshape(-1)[pixels]] for plane in seen.triangles.planes)
     pixels = pixels[(normals @ T_here_there[:3, 3] - offsets) * -offsets > 0.0]

@@ -38,7 +38,7 @@ MOST_BROKEN_TIES = 0.25
 FLOOR_M = 1e4
 """Half the side of a floor, or of a capture's board, which are in no file: planes, whose colour is not judged."""
 
-FLOOR, TABLE, FIRST_OBJECT = 1, 2, 3
+FLOOR, TABLE, FIRST_OBJECT, FIRST_CLUTTER = 1, 2, 3, 200
 
 
 def name_of(row: Row) -> str:
@@ -86,7 +86,7 @@ class StoredPair:
     """Findings of targets, of every view."""
     absent: list[str] = field(default_factory=list)
     """Why targets were not judged: shapes that are not stored."""
-    given: tuple[Sequence[tuple[str | None, Array]], Sequence[Array]] | None = None
+    given: tuple[Sequence[tuple[str | None, Array | None]], Sequence[Array]] | None = None
     """Instances and poses of objects, and poses of cameras, that the table of scenes has; None where it is not at hand."""
 
     stands: Mapping[str, Sequence[Stand]] = field(default_factory=dict)
@@ -143,6 +143,16 @@ class StoredPair:
         return self.scene["bodies"] or [{**self.scene, "region_id": FIRST_OBJECT}]
 
     @property
+    def surroundings(self) -> Mapping[str, Any]:
+        """What was drawn of `look`; empty where a job asks for nothing."""
+        return self.scene["surroundings"] or {}
+
+    @property
+    def clutter(self) -> list[Row]:
+        """Objects that have no rows of their own: region_id, category, instance_id and T_world_obj."""
+        return list(self.surroundings.get("clutter", ()))
+
+    @property
     def regions(self) -> list[int]:
         """Region ids of the objects."""
         return [body["region_id"] for body in self.bodies]
@@ -185,7 +195,7 @@ def things_of(pair: StoredPair) -> list[tuple[int, Faces, Array]]:
     scene, things = pair.scene, list[tuple[int, Faces, Array]]()
     table = {"region_id": TABLE, "category": "table", "instance_id": scene["table_id"]}
     on_table = not pair.is_captured and not pair.is_studio
-    for body in (*([table] if on_table else []), *pair.bodies):
+    for body in (*([table] if on_table else []), *pair.bodies, *pair.clutter):
         path = f"assets/{body['category']}/{body['instance_id']}.glb"
         if path not in pair.shapes:
             shape = read_shape(pair.read(path))
@@ -201,6 +211,11 @@ def _plane() -> Faces:
     corners = FLOOR_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     points = corners[[[0, 1, 2], [0, 2, 3]]]
     return replace(bare_faces(points), normals=np.broadcast_to([0.0, 0.0, 1.0], points.shape))
+
+
+def of_objects(region: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Whether region ids are of objects with rows."""
+    return (region >= FIRST_OBJECT) & (region < FIRST_CLUTTER)
 
 
 def own_region(kind: str) -> int | None:
@@ -255,7 +270,7 @@ def check_depth(pair: StoredPair, view: Row) -> Iterator[str]:
         yield f"depth from {some.min() / units} to {some.max() / units} m is outside images.depth_range_m"
     if (depth[region == 0] > 0).any() and not pair.is_captured:
         yield "depth where the mask says that nothing was hit"
-    points, _ = unproject(view, np.where(region == FLOOR, depth, 0))
+    points, _ = unproject(view, np.where((region == FLOOR) & ~on_walls(pair, view), depth, 0))
     if points.shape[1] and not pair.job["sensor"]["depth_noise"]:
         up = matrix(view, "T_world_cam")[2]
         rounding = 0.5 / units * np.abs(up[:3] @ (points[:3] / points[2]))
@@ -264,13 +279,33 @@ def check_depth(pair: StoredPair, view: Row) -> Iterator[str]:
             yield f"floor pixels lie up to {height_m.max() * 1e3:.3f} mm off the floor's plane"
 
 
+BEFORE_WALL_M, BEHIND_WALL_M = 0.05, 0.11
+"""What stands before the inner face of a wall, as a window does, and how thick it is."""
+
+
+def on_walls(pair: StoredPair, view: Row) -> NDArray[np.bool_]:
+    """[H, W]: pixels of the floor's region that show a room's walls, or lie too far away to be stored."""
+    depth, region = pair.images[name_of(view), "depth"], pair.images[name_of(view), "region"]
+    shown = np.zeros(region.shape, np.bool_)
+    if (size_m := pair.surroundings.get("room_m")) is None:
+        return shown
+    points, pixels = unproject(view, np.where(region == FLOOR, depth, 0))
+    x, y, z, _ = np.abs(matrix(view, "T_world_cam") @ points)
+    beyond = np.maximum(x - size_m[0] / 2, y - size_m[1] / 2)
+    shown.reshape(-1)[pixels] = (beyond > -BEFORE_WALL_M) & (beyond < BEHIND_WALL_M) & (z < size_m[2] + 1e-3)
+    return shown | ((region == FLOOR) & (depth == 0))
+
+
 def check_labels(pair: StoredPair, view: Row) -> Iterator[str]:
     """Regions, pixel counts, boxes, object poses and image coordinates."""
     region, labels = pair.images[name_of(view), "region"], pair.labels(view)
     poses = {body["region_id"]: matrix(body, "T_world_obj") for body in pair.bodies}
     if not pair.is_studio:
         poses[TABLE] = matrix(pair.scene, "T_world_table")
-    if labels.keys() != poses.keys() or not set(np.unique(region).tolist()) <= {0, FLOOR, *poses}:
+    if labels.keys() != poses.keys() or not set(np.unique(region).tolist()) <= {
+        *(0, FLOOR, *poses),
+        *(body["region_id"] for body in pair.clutter),
+    }:
         yield f"regions are {sorted(labels)} in objects, {sorted(poses)} in scenes, {np.unique(region)} in the mask"
         return
     rgb = pair.images.get((name_of(view), "rgb"), region)
@@ -280,7 +315,7 @@ def check_labels(pair: StoredPair, view: Row) -> Iterator[str]:
         and ((rgb[..., 3] == 0) & (region > 0) | (rgb[..., 3] == 255) & (region == 0)).any()
     ):
         yield "alpha is 0 where the mask shows something, or 255 where it does not"
-    if view["object_pixels"] != np.count_nonzero(region >= FIRST_OBJECT):
+    if view["object_pixels"] != np.count_nonzero(of_objects(region)):
         yield f"object_pixels {view['object_pixels']} is not the number of pixels of objects"
     for number, label in labels.items():
         T = np.linalg.inv(matrix(view, "T_world_cam")) @ poses[number]

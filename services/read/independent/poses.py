@@ -14,6 +14,7 @@ import numpy as np
 from services.read.independent import derive
 from services.read.independent.cameras import Subject, beside_transform, check_stands, orbits_of
 from services.read.independent.derive import (
+    FIRST_CLUTTER,
     FIRST_OBJECT,
     ROUNDING,
     TABLE,
@@ -23,6 +24,7 @@ from services.read.independent.derive import (
     distance,
     matrix,
     name_of,
+    of_objects,
     things_of,
     unproject,
 )
@@ -42,7 +44,7 @@ def check_orbit(pair: StoredPair) -> Iterator[str]:
     low, high = np.sin(orbit["inclination_rad"])
     if isinstance(radius := orbit["radius_m"], str):
         share = FIT if radius == "fit" else float(radius.rstrip("% ")) / 100.0
-        seen = np.count_nonzero(pair.images["input", "region"] >= FIRST_OBJECT) / pair.images["input", "region"].size
+        seen = np.count_nonzero(of_objects(pair.images["input", "region"])) / pair.images["input", "region"].size
         off = 0.0 if seen <= FIT_SLACK * share else math.inf
     else:
         # The point looked at, where it is nearest to the vertical line through the centre, or as near as the radius allows.
@@ -67,8 +69,8 @@ def check_given(pair: StoredPair) -> Iterator[str]:
             body["instance_id"] for body in pair.bodies
         ]:
             yield "objects are not those of scenes_from"
-        for body, (_, T) in zip(pair.bodies, objects, strict=False):
-            wanted.append((f"T_world_obj of region {body['region_id']}", matrix(body, "T_world_obj"), T))
+        there = [(f"T_world_obj of region {body['region_id']}", matrix(body, "T_world_obj")) for body in pair.bodies]
+        wanted = [(*each, T) for each, (_, T) in zip(there, objects, strict=False) if T is not None]
     if pair.has_given_cameras:
         number = view["parent_id"] // 2 % pair.job["pairs_per_scene"]
         wanted.append(("T_world_cam of the input view", matrix(view, "T_world_cam"), cameras[number]))
@@ -146,7 +148,7 @@ def _subject(pair: StoredPair) -> Subject:
     """What named cameras are placed about. Raises FileNotFoundError without a shape's file."""
     world = {region: (shape.points.reshape(-1, 3), T) for region, shape, T in things_of(pair)}
     at = {region: points @ T[:3, :3].T + T[:3, 3] for region, (points, T) in world.items()}
-    objects = [region for region in world if region >= FIRST_OBJECT]
+    objects = [region for region in world if FIRST_OBJECT <= region < FIRST_CLUTTER]
     top_m = float(at[TABLE][:, 2].max()) if TABLE in at else 0.0
     nearest_m = pair.job["images"]["depth_range_m"][0]
     return Subject(np.concatenate([at[region] for region in objects]), top_m, nearest_m)
@@ -155,7 +157,7 @@ def _subject(pair: StoredPair) -> Subject:
 def _derive_d_z(pair: StoredPair) -> float:
     """Metres: a percentile (interpolated linearly) of the object's stored input depth."""
     mirror, depth = pair.job["cameras"]["mirror"], pair.images["input", "depth"]
-    z = np.sort(depth[(pair.images["input", "region"] >= FIRST_OBJECT) & (depth > 0)])
+    z = np.sort(depth[of_objects(pair.images["input", "region"]) & (depth > 0)])
     if not len(z):
         return math.nan
     units = np.interp(mirror["percentile"] / 100.0 * (len(z) - 1), np.arange(len(z)), z)
@@ -208,8 +210,16 @@ def list_underived(job: Mapping[str, Any], at_hand: Collection[str]) -> list[str
     ]
     if sensor["depth_noise"]:
         lines.append("depth is not compared with the floor's plane: sensor.depth_noise is on")
+    look = job.get("look", {})
+    if look.get("room"):
+        lines.append("walls are compared with the size of their room alone: their shape is in no file")
     if views := job.get("targets", {}).get("views"):
         lines += ["albedo of the floor is not derived: its look is in no file"] if "albedo" in views else []
+        lines += (
+            ["albedo of tables is not derived: look.table covers them"]
+            if "albedo" in views and look.get("table")
+            else []
+        )
         lines += ["covisible is derived at some of its pixels: 2,000 of a view at most"] if "covisible" in views else []
     return lines
 
@@ -303,18 +313,20 @@ SHARE = 0.01
 
 def check_forces(job: Mapping[str, Any], scene: Row) -> Iterator[str]:
     """What the forces of a scene's contacts do not explain, a sentence each."""
-    bodies = scene["bodies"] if KEPT not in scene["effects"] else None
+    bodies = scene["bodies"] if KEPT not in scene.get("effects", ()) else None
     falls = job.get("captures") is None and job.get("scene") != "studio"
     if not bodies or not falls or not job["physics"]["exact_rest"]:
         return
     where, frictions = f"scene {scene['scene_id']}", {TABLE: _friction_of(job, "table")}
+    for body in (scene.get("surroundings") or {}).get("clutter") or ():
+        frictions[body["region_id"]] = _friction_of(job, body["category"])
     for body in bodies:
         expected, stored = _friction_of(job, body["category"]), body.get("friction")
         frictions[body["region_id"]] = expected if stored is None else stored
         if stored != (expected if isinstance(job["physics"]["friction"], dict) else None):
             yield f"{where}, region {body['region_id']}: its friction is {stored}, and physics.friction gives {expected:g}"
     for body in bodies:
-        others = np.array([frictions.get(contact["with_region"], math.nan) for contact in body["contacts"]])
+        others = np.array([frictions.get(contact["with_region"], math.inf) for contact in body["contacts"]])
         friction = np.minimum(frictions[body["region_id"]] * others, MOST_FRICTION)
         yield from (f"{where}, region {body['region_id']}: {fault}" for fault in _check_body(body, friction))
     yield from (f"{where}: {fault}" for fault in _check_reactions(bodies))
@@ -354,7 +366,7 @@ def _check_reactions(bodies: list[Row]) -> Iterator[str]:
     forces = dict[tuple[int, int], Array]()
     for body in bodies:
         for contact in body["contacts"]:
-            if contact["with_region"] != TABLE:
+            if FIRST_OBJECT <= contact["with_region"] < FIRST_CLUTTER:
                 pair = (body["region_id"], contact["with_region"])
                 total = forces.setdefault(pair, np.zeros(3))
                 total += contact["force"]

@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.read.independent.derive import (
+    FIRST_CLUTTER,
     FIRST_OBJECT,
     FLOOR,
+    TABLE,
     Array,
     Kind,
     Row,
@@ -23,6 +25,8 @@ from services.read.independent.derive import (
     faces_of,
     matrix,
     name_of,
+    of_objects,
+    on_walls,
 )
 from services.read.independent.rays import (
     BEHIND_M,
@@ -127,7 +131,7 @@ def judge_images(pair: StoredPair, view: Row, faces: Faces) -> list[Finding]:
     own = hits.where(faces.region[hits.face] == region[hits.pixel])
     seen = (kind for kind in pair.kinds(view["role"]).values() if kind.formula is not None)
     findings = [_judge_seen(kind, pair, view, faces, own) for kind in seen]
-    objects = hits.where(faces.region[hits.face] >= FIRST_OBJECT)
+    objects = hits.where(of_objects(faces.region[hits.face]))
     if "covisible" in pair.kinds(view["role"]):
         findings.append(_judge_covisible(pair, view, faces, own))
     if "amodal" in asked:
@@ -181,7 +185,12 @@ def _judge_seen(kind: Kind, pair: StoredPair, view: Row, faces: Faces, own: Hits
     shown = region >= least
     if kind.formula == "albedo" and np.isnan(faces.colors[faces.region == FLOOR]).any():
         shown &= region != FLOOR
+    if kind.formula == "albedo" and pair.surroundings.get("table"):
+        shown &= region != TABLE
+    shown &= ~on_walls(pair, view).reshape(-1)
     judged = shown | (region < least)
+    if least == FIRST_OBJECT:
+        shown &= region < FIRST_CLUTTER
     off = np.where(stored.any(axis=1), np.inf, 0.0)
     if not pair.is_captured:
         off[shown] = np.inf
@@ -300,7 +309,7 @@ def _judge_covisible(pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Fi
     As many at edges of the mask as of objects elsewhere, evenly by number; not those near an edge in this view, see `seen_by`.
     """
     mask, first, around = pair.images[name_of(view), "covisible"], pair.views["input"], np.ones((3, 3), np.uint8)
-    shown = pair.images[name_of(view), "region"] >= FIRST_OBJECT
+    shown = of_objects(pair.images[name_of(view), "region"])
     beside = shown & (cv2.dilate(mask * shown, around) != cv2.erode(np.where(shown, mask, 255), around))
     chosen = [np.flatnonzero(some) for some in (beside, shown & ~beside)]
     pixels = np.sort(np.concatenate([some[:: len(some) // COVISIBLE_PIXELS + 1] for some in chosen]))
@@ -379,7 +388,8 @@ def _judge_nearest(pair: StoredPair, view: Row, faces: Faces, hits: Hits) -> Fin
     nearest = covers.where(np.unique(covers.pixel, return_index=True)[1])
     right, off = (region == 0) & (depth == 0), np.zeros(len(region))
     right[nearest.pixel], off[nearest.pixel] = fits(nearest.pixel, nearest)
-    exact = _Exact("depth and region", "mm", np.ones(len(region), bool), ~right, off)
+    judged = ~on_walls(pair, view).reshape(-1)
+    exact = _Exact("depth and region", "mm", judged, judged & ~right, off)
     return _settle(exact, view, faces, hits, fits_choice)
 
 

@@ -423,6 +423,14 @@ OFF = {
     "start.pile_offset_m": ([-0.1, 0.1], {"objects_per_scene": 3}, "start.arrange is spread"),
     "physics.concavity": (0.1, {"physics": {"collision": "hull"}}, "makes no convex parts"),
     "studio.size_m": (2.0, {"scene": "studio"}, "studio.scale is metric"),
+    "look.recolour": ("packaging", {"render": {"tier": "flat"}}, "render.tier is flat"),
+    "look.floor": (
+        {"colours": [[0.5, 0.5, 0.5]]},
+        {"render": {"tier": "flat"}},
+        "given and has no effect: render.tier is flat",
+    ),
+    "look.table": ({"folder": "x"}, {"render": {"rgb": False}}, "render.rgb is false"),
+    "look.background": ("x", {"render": {"tier": "flat"}}, "render.tier is flat"),
 }
 ON = {
     "render": {"tier": "pathtraced", "path_samples": 4, "path_bounces": 2},

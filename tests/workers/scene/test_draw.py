@@ -69,7 +69,8 @@ def test_a_stream_is_a_function_of_seed_scene_step_and_object():
     assert sensors[1].random() != sensors[2].random() != chance.stream(Stream.SENSOR, 3).random()
     names = "CATEGORY OBJECT TABLE START REDRAW CAMERA APPEARANCE RAYCAST_CHECK SENSOR_DEPTH SENSOR_RGB SENSOR_EXPOSURE"
     names += " PATHS COUNT HIDDEN_MARKERS MOTION HELD_OUT LOST SENSOR ORBIT MORE MIRROR"  # append-only: numbers are in datasets
-    assert [(stream.name, int(stream)) for stream in Stream] == [(name, n) for n, name in enumerate(names.split())]
+    numbers = dict(zip(names.split(), range(21), strict=True)) | {"SURROUNDINGS": 23, "CLUTTER": 24}
+    assert {stream.name: int(stream) for stream in Stream} == numbers
 
 
 def test_categories_counts_and_checked_scenes_come_with_their_shares():

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,15 +15,23 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
 
-from schemas.errors import AssetSourceError, OutputError
+from schemas.errors import AssetSourceError, OutputError, SettleError
+from schemas.scene.scene import EffectPlan
+from schemas.scene.shape import Asset
 from services.job.job_file import validate_job
 from services.job.record import record_job
 from services.read import audit
 from services.read.replay import replay_scene
 from tests.datasets import SMALL, faults_of, images_of, make_dataset, overlaid
+from tests.kit.shapes import asset_of, box, table
+from tests.physics.settling import PHYSICS, scene_of, start_at
 from tests.services.export.exported import export_to
+from tests.workers.assets.libraries import library_of
 from workers.assets.scene_tables import read_scene
 from workers.capture.results import open_sources
+from workers.geometry.frames import invert, pose, rotation_about, transform
+from workers.physics.settle import keep_scene
+from workers.physics.support import place_table
 from workers.store.local import LocalStore
 
 THREE: dict[str, Any] = {
@@ -140,6 +149,47 @@ def test_a_bop_scene_of_our_shapes_is_rebuilt_to_a_hundredth_of_a_millimetre_and
             assert numbers[0].shape == numbers[1].shape and np.abs(numbers[0] - numbers[1]).max() < 1e-6
 
 
+def test_a_bop_scene_of_other_models_stands_where_their_own_frames_say(tmp_path):
+    """A model in millimetres whose frame is off its middle, mapped by the user's objects.csv: its corners are where they were."""
+    model = box(60.0, 80.0, 120.0, at=(200.0, -30.0, 60.0))
+    (tmp_path / "models").mkdir()
+    model.export(tmp_path / "models/obj_000005.ply")
+    assets = {"objects": [library_of(tmp_path / "models", "carton", units=(("*", 0.001),))], **TRAYS["assets"]}
+    job = {"categories": ["carton"], "assets": assets, "check": {"overlap_mm": 1e3}, "scenes": 1, "first_scene": 48}
+    catalogue = open_sources(validate_job(overlaid(SMALL, job), "a test"), tmp_path)
+    T_world_model, T_cam_world = (
+        pose(rotation_about(np.array([0.0, 0.6, 0.8]), 0.7), np.array([0.1, 0.0, 0.9])),
+        invert(look_down()),
+    )
+    T_cam_model = T_cam_world @ T_world_model
+    camera = {"cam_K": [140.0, 0, 80.0, 0, 141.0, 60.0, 0, 0, 1], "cam_R_w2c": T_cam_world[:3, :3].ravel().tolist()}
+    body = {
+        "obj_id": 5,
+        "cam_R_m2c": T_cam_model[:3, :3].ravel().tolist(),
+        "cam_t_m2c": (1e3 * T_cam_model[:3, 3]).tolist(),
+    }
+    folder = tmp_path / "bop/test/000048"
+    folder.mkdir(parents=True)
+    cameras = {n: {**camera, "cam_t_w2c": (1e3 * T_cam_world[:3, 3]).tolist()} for n in (3, 4)}
+    (folder / "scene_camera.json").write_text(json.dumps(cameras))
+    (folder / "scene_gt.json").write_text(json.dumps({3: [body], 4: [body]}))
+    (tmp_path / "bop/camera.json").write_text(json.dumps({"width": 160, "height": 120}))
+    (instance,) = (catalogue.refer(0, "carton", 0).instance_id,)
+    (tmp_path / "bop/objects.csv").write_text(f"obj_id,instance_id\n5,{instance}\n")
+    store = make_dataset(tmp_path / "out", **job, scenes_from=str(folder), pairs_per_scene=2)[0]
+    (scene,), (asset, *_) = rows_of(store, "scenes"), (catalogue.load(catalogue.refer(0, "carton", 0)),)
+    corners = transform(np.reshape(scene["T_world_obj"], (4, 4)), asset.shape.vertices)
+    wanted = transform(T_world_model, 1e-3 * np.array(model.vertices))
+    assert np.abs(np.sort(corners @ PLANE) - np.sort(wanted @ PLANE)).max() < 1e-5
+    inputs = [view for view in rows_of(store, "views") if view["role"] == "input"]
+    assert [(view["fx"], view["cx"], view["cy_opencv"]) for view in inputs] == [(140.0, 80.5, 60.0)] * 2
+    assert faults_of(store) == audit.verify_independently(store, 1, lambda _: None).faults == []
+
+
+PLANE = np.array([0.3, 0.5, 0.81])
+"""A direction along which no two corners of a box are at one place."""
+
+
 def numbers_in(tree: Any) -> Any:
     """Every number of a tree of JSON, but for the number that an export gives to an instance."""
     if isinstance(tree, dict):
@@ -188,6 +238,38 @@ def test_what_is_kept_is_measured_where_it_was_put_and_what_settles_falls(standi
     assert faults_of(store) == audit.verify_independently(store, 7, lambda _: None).faults == []
 
 
+CUBE, OPEN = asset_of(box(0.1, 0.1, 0.1)), box(0.1, 0.1, 0.1)
+OPEN.update_faces(OPEN.face_normals[:, 2] < 0.5)
+SMALL_CUBE, ON = asset_of(box(0.02, 0.02, 0.02)), place_table(table())
+KEPT: dict[str, tuple[list[tuple[Asset, float, float]], list[tuple[float, float]] | str]] = {
+    "beside another, in the air": ([(CUBE, 0.0, 0.0), (CUBE, 0.105, 0.2)], [(0.0, 0.0), (200.0, 0.0)]),
+    "above another": ([(CUBE, 0.0, 0.0), (CUBE, 0.0, 0.107)], [(0.0, 0.0), (7.0, 0.0)]),
+    "on the floor": ([(CUBE, 2.0, -0.7)], [(0.0, 0.0)]),
+    "in the floor": ([(CUBE, 2.0, -0.7003)], [(0.0, 0.3)]),
+    "under the table": ([(CUBE, 0.0, -0.3)], [(400.0, 0.0)]),
+    "in an open shell": ([(asset_of(OPEN), 0.0, 0.0), (SMALL_CUBE, 0.0, 0.04)], [(0.0, 0.0), (40.0, 0.0)]),
+    "an open shell in the table": ([(asset_of(OPEN), 0.0, -0.015)], "region 3 (box-test) is 15.00 mm inside the table"),
+    "whole in another": (
+        [(CUBE, 0.0, 0.0), (SMALL_CUBE, 0.0, 0.04)],
+        "region 3 (box-test) is 20.00 mm inside region 4",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", KEPT)
+def test_overlap_and_hover_are_distances_of_the_true_bodies(name):
+    """Of cubes over a table of 0.7 m: (asset, x, height of its underside over the table, metres), and (hover, overlap) in mm."""
+    things, figures = KEPT[name]
+    poses = [pose(np.eye(3), np.array([x, 0.0, 0.7 + z_m + asset.extents_m[2] / 2])) for asset, x, z_m in things]
+    starts = [start_at(asset, T, 3 + n) for n, ((asset, _, _), T) in enumerate(zip(things, poses, strict=True))]
+    if isinstance(figures, str):
+        with pytest.raises(SettleError, match=re.escape(figures)):
+            keep_scene(scene_of(starts, ON), PHYSICS, EffectPlan((), {}), 1.0)
+        return
+    kept = keep_scene(scene_of(starts, ON), PHYSICS, EffectPlan((), {}), 1.0).settled
+    assert np.abs(np.subtract([(each.hover_gap_mm, each.penetration_mm) for each in kept], figures)).max() < 1e-6
+
+
 def look_down() -> np.ndarray:
     """A camera 2.5 m up that looks straight down."""
     T = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -216,7 +298,7 @@ def test_a_row_that_cannot_be_fails_its_scene_alone_with_the_figure(standing, tm
             "no source in assets.objects offers 'zebra'",
         ),
         ([{**row(0, standing), "category": "can"}], "box-0-000005 is a box, and category is 'can'"),
-        ([{**row(0, standing), "table_id": "tray-7-000000"}], "no source in assets.tables has tray-7-000000"),
+        ([{**row(0, standing), "table_id": "tray-7-000000"}], "no source in assets.tables has 'tray-7-000000'"),
         ([row(0, lost)], "row 0 of scene 8 in"),
         ([row(0, mirrored)], "T_world_obj mirrors: its determinant is -1"),
         ([row(0, scaled)], "T_world_obj is no rotation"),
@@ -361,10 +443,10 @@ def test_a_worker_holds_a_few_scenes_of_a_million_rows(tmp_path):
         T = np.tile(np.eye(4).ravel(), (count, 1))
         T[:, 3] = np.random.default_rng(0).random(count)
         columns = {f"T{n // 4}{n % 4}": T[:, n] for n in range(16)}
-        table = pa.table(
+        million = pa.table(
             {"scene_id": np.arange(count), "instance_id": pa.array([BOX]).take(pa.array([0] * count)), **columns}
         )
-        pq.write_table(table, tmp_path / "a.parquet", row_group_size=count)
+        pq.write_table(million, tmp_path / "a.parquet", row_group_size=count)
         command = [sys.executable, "-c", READ, str(tmp_path / "a.parquet"), str(count - 1)]
         peaks.append(int(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
     assert peaks[1] - peaks[0] < 60 * 1024, peaks

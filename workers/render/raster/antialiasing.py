@@ -34,13 +34,13 @@ _LINEAR = np.rint(SRGB_STEPS * LINEAR_STEPS).astype(np.uint16)
 _SRGB = np.rint(255.0 * encode_srgb(np.arange(LINEAR_STEPS + 1) / LINEAR_STEPS)).astype(np.uint8)
 
 
-def find_edges(rgb: NDArray[np.uint8], region: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def find_edges(rgb: NDArray[np.uint8], region: NDArray[np.uint8], walled: bool = False) -> NDArray[np.uint8]:
     """[H, W] uint8: 255 at edge pixels of rgb [H, W, 3], whose colour is more than `CONTRAST` from one of four neighbours.
 
-    Two pixels of the floor (region [H, W]) make no edge: the floor's texture is filtered already.
+    Two pixels of the floor (region [H, W]) make no edge: its texture is filtered already. `walled`: with walls they do.
     """
     mask = np.zeros(region.shape, np.uint8)
-    _mark_edges(np.ascontiguousarray(rgb), np.ascontiguousarray(region), REGION_FLOOR, CONTRAST, mask)
+    _mark_edges(np.ascontiguousarray(rgb), np.ascontiguousarray(region), -1 if walled else REGION_FLOOR, CONTRAST, mask)
     return mask
 
 

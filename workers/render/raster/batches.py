@@ -221,6 +221,7 @@ def _is_faceted(part: Part) -> bool:
 def _pack(parts: list[Part], highest_m: float) -> Batch:
     packed, indices, start = [], [], 0
     albedos = decode_srgb(np.array([part.material.base_color[:3] for part in parts]))
+    albedos = albedos * np.array([[1.0 + part.material.emission] for part in parts])
     for part, albedo in zip(parts, albedos, strict=True):
         faces, source = own_vertices(part.faces, len(part.vertices))
         vertices = _vertex_columns(part, albedo, source)

@@ -237,7 +237,7 @@ def sort_draws(
         name = NAMES.get(thing.region_id)
         if name is not None and not view.effects.runs(name):
             continue
-        shape, ground = fetch(thing.shape), thing.region_id == REGION_FLOOR
+        shape, ground = fetch(thing.shape), is_floor(thing)
         split = raster and has_level_top(thing)
         hides = thing.region_id == REGION_TABLE and not view.cut
         T_cam_shape = view.T_cam_world @ thing.T_world_shape
@@ -258,6 +258,12 @@ def sort_draws(
                 variant = Variant(*look, ground, level, view.labels, cutout, planar, ground and not ground_z)
                 by_variant.setdefault(variant, []).append(Draw(thing, T_cam_shape, batch, culls, first, count))
     return by_variant
+
+
+def is_floor(thing: Placed) -> bool:
+    """Whether a thing is the level floor, and not the walls, which have its region too."""
+    low, high = thing.shape.bounds[:, 2]
+    return thing.region_id == REGION_FLOOR and bool(low == high)
 
 
 def is_plain(shape: Shape, view: RenderPass) -> bool:

@@ -35,7 +35,7 @@ from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FLOOR, Appearance
 from schemas.scene.view import Camera, GBuffer, Intrinsics
 from workers.geometry.frames import invert
-from workers.geometry.pixels import fill_plane_depth, fourth_channel, is_inner
+from workers.geometry.pixels import fill_image, fill_plane_depth, fourth_channel, is_inner
 from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
 from workers.render.raster.context import (
@@ -194,6 +194,7 @@ class Renderer:
         if ground is not None:
             fill_plane_depth(depth_m, region, REGION_FLOOR, ground, view.k)
         if rgb is not None:
+            put_behind(rgb, region == 0, appearance.backdrop)
             self._refine(rgb, region, things, view, render.samples)
             rgb.setflags(write=False)
         self._scene_size = len(things)
@@ -287,7 +288,7 @@ class Renderer:
             self._cut_out(rgb, things, view)
         if not view.effects.runs("antialiasing"):
             return
-        mask = find_edges(rgb, region)
+        mask = find_edges(rgb, region, sum(thing.region_id == REGION_FLOOR for thing in things) > 1)
         if view.effects.runs("alpha"):
             mask[~is_inner(region)] = 0  # alpha has the outline: a blend with what is behind would darken it
         if not view.effects.runs("samples"):
@@ -313,7 +314,9 @@ class Renderer:
         """[H, W, 4] uint8 sRGB of the pixels that were selected; `cut`: with holes cut out."""
         self._colour_target.clear(view.appearance)
         self._draw_things(things, replace(view, labels=False, cut=cut))
-        return self._colour_target.read(np.empty((view.k.height, view.k.width, 4), np.uint8))
+        drawn = self._colour_target.read(np.empty((view.k.height, view.k.width, 4), np.uint8))
+        put_behind(drawn, drawn[..., 3] == 0, view.appearance.backdrop)
+        return drawn
 
     def _program(self, variant: Variant) -> Program:
         if variant not in self._programs:
@@ -344,6 +347,12 @@ class Renderer:
         # OpenCV splits channels 20 times faster than a numpy slice is copied, and faster than GL_RGB is read.
         rgb: NDArray | None = cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB) if view.color else None
         return rgb, depth, fourth_channel(rgba)
+
+
+def put_behind(rgb: NDArray[np.uint8], nothing: NDArray[np.bool_], backdrop: NDArray[np.uint8] | None) -> None:
+    """Puts a picture into the colours [H, W, 3 or 4] of the pixels that show nothing [H, W], as large as fills the image."""
+    if backdrop is not None and nothing.any():
+        rgb[nothing, :3] = fill_image(backdrop, nothing.shape[1], nothing.shape[0])[nothing]
 
 
 def _is_lit(render: Render, effects: EffectPlan) -> bool:

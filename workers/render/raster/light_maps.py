@@ -16,7 +16,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, Appearance
 from workers.render.raster import baking
 from workers.render.raster.baking import SHADOW_PX, Box
 from workers.render.raster.buffers import ShapeStore
-from workers.render.raster.draw_calls import LEVEL_UNIT, SHADOW_UNIT, MapPlacement, Program
+from workers.render.raster.draw_calls import LEVEL_UNIT, SHADOW_UNIT, MapPlacement, Program, is_floor
 from workers.render.raster.lit_shaders import CAST_VERTEX, EMPTY_FRAGMENT
 
 UPRIGHT = 1.0 - 1e-9
@@ -80,7 +80,7 @@ class LightMaps:
     def bind(self, program: Program, thing: Placed) -> None:
         """Bind the maps that light a thing, for the program in use."""
         gl, baked = self._gl, self._baked
-        ground = thing.region_id == REGION_FLOOR
+        ground = is_floor(thing)
         level = baked.floor if ground else baked.stand
         texture = self._open if level is None else self._floor if ground else self._stand
         for unit, name in ((LEVEL_UNIT, texture), (SHADOW_UNIT, self._shadow)):
@@ -122,7 +122,7 @@ class LightMaps:
     def _place(self, thing: Placed) -> MapPlacement:
         """Where a thing lies in the maps that light it."""
         light = self._baked.light
-        level = self._baked.floor if thing.region_id == REGION_FLOOR else self._baked.stand
+        level = self._baked.floor if is_floor(thing) else self._baked.stand
         level_from_shape = np.zeros((4, 4)) if level is None else level.unit_from_world @ thing.T_world_shape
         # Without shadows all lies before the map, where light arrives.
         shadow_from_shape, softness = np.diag([0.0, 0.0, 0.0, 1.0]), (0.0, 1.0, 0.0)

@@ -1,0 +1,73 @@
+"""What `look` puts around the objects of a scene that is planned, from streams of its own, so that nothing else moves."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+
+from schemas.job.job import Job
+from schemas.job.look import Look, Surface
+from schemas.scene.scene import ScenePlan
+from schemas.scene.shape import Shape
+from workers.assets.catalogue import Catalogue
+from workers.assets.pictures import load_picture
+from workers.assets.surroundings import Coat, build_room, cover_floor, cover_table, draw_coat, require_table_inside
+from workers.scene.chance import SceneChance, Stream
+from workers.scene.effects import BRANCHES
+from workers.scene.plan import add_clutter
+
+FLOOR, TABLE, BACKGROUND, ROOM = range(4)
+"""Parts of the stream of surroundings."""
+
+ROUGH, SMOOTH = 0.9, 0.8
+"""Roughness of a floor's cover and of a table's: neither has highlights."""
+
+
+def look_without(look: Look, names: Collection[str]) -> Look:
+    """The look without the effects of these names."""
+    off = {branch: Look.model_fields[branch].default for name, branch in BRANCHES.items() if name in names}
+    return look.model_copy(update=off) if off else look
+
+
+def surround(job: Job, look: Look, catalogue: Catalogue, chance: SceneChance, plan: ScenePlan) -> ScenePlan:
+    """The plan with covers of floor and table, a room and what is behind everything, as far as they are asked for.
+
+    Raises StartError where the table does not fit into the room.
+    """
+    drawn: dict[str, object] = {}
+    if plan.ground is not None:
+        ground = plan.ground
+        if look.floor is not None:
+            floor, coat = lay_floor(look.floor, catalogue, chance, ground.floor)
+            drawn |= _named("floor", coat)
+            ground = replace(ground, floor=floor)
+        if look.table is not None:
+            rng, pictures = chance.stream(Stream.SURROUNDINGS, TABLE), catalogue.pictures.get("look.table.folder", ())
+            coat = draw_coat(look.table, pictures, rng, SMOOTH)
+            drawn |= _named("table", coat)
+            ground = replace(ground, cover=cover_table(ground.table.asset, coat))
+        if look.room is not None:
+            towards = plan.appearance.lights[0].direction
+            walls = build_room(look.room, towards, chance.stream(Stream.SURROUNDINGS, ROOM))
+            require_table_inside(walls, ground.table.mesh.vertices)
+            drawn["room_m"] = walls.size_m.tolist()
+            ground = replace(ground, walls=walls)
+        plan = replace(plan, ground=ground)
+        if look.clutter is not None:
+            plan = add_clutter(job, look.clutter, catalogue, chance, plan)
+    if look.background is not None:
+        pictures = catalogue.pictures["look.background"]
+        picture = pictures[int(chance.stream(Stream.SURROUNDINGS, BACKGROUND).integers(len(pictures)))]
+        drawn["background"] = picture.name
+        plan = replace(plan, appearance=replace(plan.appearance, backdrop=load_picture(picture)))
+    return replace(plan, surroundings=drawn) if drawn or look.clutter is not None else plan
+
+
+def lay_floor(surface: Surface, catalogue: Catalogue, chance: SceneChance, floor: Shape) -> tuple[Shape, Coat]:
+    """The floor as a scene has it, and what it is covered with."""
+    rng = chance.stream(Stream.SURROUNDINGS, FLOOR)
+    coat = draw_coat(surface, catalogue.pictures.get("look.floor.folder", ()), rng, ROUGH)
+    return cover_floor(floor, coat), coat
+
+
+def _named(key: str, coat: Coat) -> Mapping[str, object]:
+    tile = None if coat.material.texture is None else float(coat.tile_m[0])
+    return {key: coat.name, f"{key}_tile_m": tile}
