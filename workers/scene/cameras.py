@@ -211,18 +211,20 @@ def place_orbits(job: Job, entry: More, chance: SceneChance, plan: ScenePlan, po
 
 
 def require_depth(job: Job, named: NamedCamera, points: Array) -> None:
-    """Raises ViewError `not_framed` where some of `points` [N, 3], world, are in the picture and beyond the range of depth."""
+    """Raises ViewError `not_framed` where some of `points` [N, 3], world, are in the picture, and too near or far for depth."""
     local, k = transform(invert(named.camera.T_world_cam), points), named.camera.intrinsics
-    (near_m, far_m), ahead = job.images.depth_range_m, local[local[:, 2] > 0.0]
+    near_m, far_m = max(NEAR_M, job.images.depth_range_m.low), job.images.depth_range_m.high
+    ahead = local[local[:, 2] > 0.0]
     u, v = project(ahead, k)
     depths = ahead[(u > 0.0) & (u < k.width) & (v > 0.0) & (v < k.height), 2]
     if len(depths) and not near_m < depths.min() <= depths.max() < far_m:
-        scaled = job.scene == "studio" and job.studio.scale == "metric"
+        remedies = ["widen images.depth_range_m"] if depths.min() > NEAR_M else []
+        metric = job.scene == "studio" and job.studio.scale == "metric"
+        remedies.append("set studio.scale: unit_sphere" if metric else "let it stand elsewhere")
         raise ViewError(
             "not_framed",
             f"camera {named.name}, number {named.number}, has the objects {depths.min():.3g} to {depths.max():.3g} m before it, "
-            f"and depth beyond images.depth_range_m, [{near_m:g}, {far_m:g}], is 0: widen that, or "
-            + ("set studio.scale: unit_sphere" if scaled else "let it stand elsewhere"),
+            f"and has depth from {near_m:g} to {far_m:g} m: {', or '.join(remedies)}",
         )
 
 

@@ -79,7 +79,7 @@ def test_what_is_left_and_its_cost_are_told_and_nothing_is_made(tmp_path):
                 "images.depth_range_m": [0.8, 8.0],
                 "cameras.more": [{"name": "a", "preset": "trellis"}],
             },
-            r"camera a, number 0, has the objects 0\.\d+ to 0\.\d+ m before it, .* \[0\.8, 8\], is 0: widen that, or set studio",
+            r"camera a, number 0, has the objects 0\.\d+ to 0\.\d+ m before it, .* 0\.8 to 8 m: widen images.* or set studio",
         ),
         ({"start.offset_m": [3, 4]}, r"none of 21 positions .* narrow start\.offset_m"),
     ],

@@ -77,6 +77,7 @@ def test_every_view_of_every_kind_shows_what_rays_meet_and_verifies(tmp_path, sc
         entry | {"name": f"cam-{kind}"} | ({"poses": poses} if kind == "poses" else {}) for kind, entry in kinds.items()
     ]
     job = {"scene": scene, "scenes": scenes, "check": {"raycast_share": 1.0}, "images": {"depth_range_m": [0.05, 13.0]}}
+    job |= {"studio": {"scale": "unit_sphere", "size_m": 0.5}} if scene == "studio" else {}  # all views have depth
     store, _ = make_dataset(tmp_path / "out", **job, cameras={"more": more, "sensor": SMALL_SENSOR})
     stored = [find_scene(store, scene_id) for scene_id in range(scenes)]
     assert not [row for each in stored for row in each.rows["failures"]]
@@ -342,7 +343,7 @@ def test_a_preset_so_near_to_a_small_metric_object_that_it_has_no_depth_is_a_fai
     if exact:
         tried(nearest_m - 1e-6)
     with pytest.raises(
-        ViewError, match=r"camera a, number \d+, has .* images.depth_range_m, .* studio.scale: unit_sphere"
+        ViewError, match=r"camera a, number \d+, has .* widen images.depth_range_m, or set studio.scale: unit_sphere"
     ):
         tried(nearest_m + 1e-6)
 
