@@ -54,6 +54,21 @@ def _plain(value: str) -> str:
     return value
 
 
+def read_counts(value: object, most: int) -> Counts:
+    """`Counts` from [low, high], or from one whole number for both. Raises ValueError outside of 1 to `most`."""
+    ends = [value, value] if isinstance(value, int) else list(value) if isinstance(value, list | tuple) else []
+    if len(ends) != 2 or not all(type(end) is int and 1 <= end <= most for end in ends):
+        raise ValueError(f"write a whole number from 1 to {most}, or two of them as [low, high]")
+    if ends[0] > ends[1]:
+        raise ValueError(f"the range {ends} is empty: write the smaller number first")
+    return Counts(*ends)
+
+
+def write_counts(count: Counts) -> int | list[int]:
+    """One number where both ends are equal."""
+    return count.low if count.low == count.high else list(count)
+
+
 Text = Annotated[str, Field(max_length=1000), AfterValidator(_plain)]
 """Words of the user's, which travel into messages, tables and file names: one line."""
 

@@ -64,8 +64,8 @@ class Column:
     """Whether the value may be missing where the column applies."""
     of: Of = "both"
     """The kind of dataset that has it, null in others: `rest`, of scenes on a table; `more`, of jobs with `cameras.more`;
-    `look`, of jobs with surroundings; `friction`, of jobs with `physics.friction` by category. A table without any value of a
-    column, or of a field of one kind inside one, has the digest of one without it."""
+    `look`, of jobs with that; `friction`, of jobs with `physics.friction` by category. A table without any value of a column, or
+    of a field of one kind inside one, has the digest of one without it."""
 
     @property
     def nullable(self) -> bool:
@@ -162,6 +162,13 @@ surroundings.table | string? | - | - | Picture of the table, below its folder, o
 surroundings.table_tile_m | double? | m | - | Width of that picture on the table.
 surroundings.background | string? | - | - | Picture behind everything, below its folder.
 surroundings.room_m | list of double? | m | world | Length along x, width along y, and height of the room inside.
+surroundings.lights | list of struct? | - | - | Lights of `look.lights`; the first casts shadows.
+surroundings.lights[].towards | list of double | 1 | world | Unit vector towards it.
+surroundings.lights[].level | double | 1 | - | Light that it gives to a level white surface, of which 1 is white.
+surroundings.lights[].temperature_k | double | K | - | Its colour temperature.
+surroundings.lights[].size_deg | double | deg | - | Angle across it.
+surroundings.environment | string? | - | - | Map of `look.environment`: name of its file, or of a built-in sky or room.
+surroundings.environment_deg | double? | deg | - | Its turn about the vertical, counter-clockwise from above.
 surroundings.clutter | list of struct? | - | - | Objects that have no other row, in images, masks and depth alone.
 surroundings.clutter[].region_id | int64 | id | - | {region}
 surroundings.clutter[].category | string | - | - | {category}

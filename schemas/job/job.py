@@ -385,7 +385,7 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
 PATHS = frozenset(
     {
         *("assets.objects.folder", "assets.tables.folder", "captures.folders", "cameras.more.poses"),
-        *("look.floor.folder", "look.table.folder", "look.background", "scenes_from"),
+        *("look.floor.folder", "look.table.folder", "look.background", "look.environment.folder", "scenes_from"),
     }
 )
 """Keys that name places, where the same files may lie elsewhere."""

@@ -4,7 +4,18 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, PlainSerializer, Tag, model_validator
 
-from schemas.base import Counts, Frozen, Interval, NonNegative, Positive, Range, Share, among_kinds
+from schemas.base import (
+    Counts,
+    Frozen,
+    Interval,
+    NonNegative,
+    Positive,
+    Range,
+    Share,
+    among_kinds,
+    read_counts,
+    write_counts,
+)
 from schemas.job.assets import SurfaceName, value_of
 
 MOST_OBJECTS = 50
@@ -13,20 +24,10 @@ MOST_OBJECTS = 50
 ONE_OBJECT = Counts(1, 1)
 
 
-def _read_count(value: object) -> object:
-    """`Counts` from [low, high], or from one whole number for both. Raises ValueError."""
-    ends = [value, value] if isinstance(value, int) else list(value) if isinstance(value, list | tuple) else []
-    if len(ends) != 2 or not all(type(end) is int and 1 <= end <= MOST_OBJECTS for end in ends):
-        raise ValueError(f"write a whole number from 1 to {MOST_OBJECTS}, or two of them as [low, high]")
-    if ends[0] > ends[1]:
-        raise ValueError(f"the range {ends} is empty: write the smaller number first")
-    return Counts(*ends)
-
-
 ObjectCount = Annotated[
     Counts,
-    BeforeValidator(_read_count),
-    PlainSerializer(lambda count: count.low if count.low == count.high else list(count)),
+    BeforeValidator(lambda value: read_counts(value, MOST_OBJECTS)),
+    PlainSerializer(write_counts),
 ]
 """A range of counts, written as one number where both ends are equal."""
 

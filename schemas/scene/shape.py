@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -219,10 +220,48 @@ class Asset:
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """A distant light: `direction` [3] unit, from the surface towards the light, world; `color` linear RGB radiance."""
+    """A distant light: `direction` [3] unit, from the surface towards the light, world; `color` linear RGB radiance.
+
+    A white surface that faces it has the radiance `color`.
+    """
 
     direction: Array
     color: tuple[float, float, float]
+    size_rad: float | None = None
+    """Angle across its disc. None: the key light's is `LAMP_RAD`, others are soft."""
+    of_surround: bool = False
+    """Whether it stands, in tier raster, for a part of the surround, which has it anyway."""
+
+
+LAMP_RAD = 0.06
+"""Angle across a key light without a size, seen from the scene: a softbox of 12 cm at 2 m."""
+
+
+@dataclass(frozen=True)
+class MapSource:
+    """A map of the light from all directions: the name of a built-in one, or of a file with its place and SHA-256, hex."""
+
+    name: str
+    path: Path | None = None
+    sha256: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Surround:
+    """Light from all directions, as a picture has it.
+
+    radiance [H, 2 H, 3] float32, linear RGB: rows from the zenith to the nadir; the middle column is the world's +x where
+    `turn_rad`, counter-clockwise from above, is 0, and columns to its right are clockwise. `scale` multiplies it.
+    terms [18, 3]: the radiance of a white surface by its normal, world, without what `Appearance.lights` give
+    (workers.geometry.irradiance).
+    """
+
+    radiance: NDArray[np.float32]
+    terms: Array
+    turn_rad: float
+    scale: float
+    shown: bool
+    """Whether the picture is seen where no surface is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,5 +280,7 @@ class Appearance:
     sheen: float = 1.0
     """Share of what Fresnel's term mirrors at grazing angles that is drawn, in the raster tier: light that comes from everywhere
     alike would draw a pale line along every outline."""
+    surround: Surround | None = None
+    """In the place of `ambient` and `below`."""
     backdrop: NDArray[np.uint8] | None = None
     """A picture [h, w, 3] uint8 sRGB in place of the background, which fills every view from edge to edge."""

@@ -32,6 +32,7 @@ from workers.scene.chance import SceneChance, Stream
 from workers.scene.context import WorkerContext
 from workers.scene.effects import Facts, plan_effects
 from workers.scene.make_scene import Scene
+from workers.scene.surround import light_scene
 
 Box = tuple[float, float, float, float]
 """(left, top, right, bottom)."""
@@ -238,8 +239,9 @@ def converged_colour(context: WorkerContext, scene: Scene, crop: Crop, paths: in
     that the raster and path-traced tiers share, and a seed of its own.
     """
     # As the path-traced tier draws it: the flat tier has another floor and other lights.
-    chance = SceneChance(context.job.seed, scene.plan.scene_id).stream(Stream.APPEARANCE)
-    floor, appearance = draw_appearance(chance, "pathtraced")
+    chance = SceneChance(context.job.seed, scene.plan.scene_id)
+    floor, appearance = draw_appearance(chance.stream(Stream.APPEARANCE), "pathtraced")
+    appearance, _ = light_scene(context.job.look, context.catalogue, chance, appearance, True)
     plan = replace(scene.plan, ground=Ground(scene.plan.table, floor), appearance=appearance)
     things = [
         Placed(thing.region_id, floor, thing.T_world_shape) if thing.region_id == REGION_FLOOR else thing

@@ -67,6 +67,8 @@ SURROUNDINGS: dict[str, tuple[str, Any]] = {
     "backdrop": ("background", PICTURES),
     "room": ("room", {"size_m": [4.5, 5.0]}),
     "clutter": ("clutter", {"count": 2}),
+    "lights": ("lights", {}),
+    "environment": ("environment", {"built_in": ["softboxes"]}),
 }
 
 NOISY = {

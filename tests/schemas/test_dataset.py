@@ -29,7 +29,7 @@ from services.cli.arguments import JOB_ID
 
 # ------------------------------------------------------------------------------------------------ columns
 
-UNITS = {"id", "count", "1", "m", "mm", "m3", "mm/s", "px", "rad", "deg", "s", "kg", "N", "byte", "1/m"}
+UNITS = {"id", "count", "1", "m", "mm", "m3", "mm/s", "px", "rad", "deg", "s", "kg", "N", "byte", "1/m", "K"}
 SUFFIXES = {"_mm_s": "mm/s", "_units_per_m": "1/m", "_mm": "mm", "_m3": "m3", "_m": "m", "_rad": "rad"}
 SUFFIXES |= {"_deg": "deg", "_s": "s", "_kg": "kg", "_px": "px", "_id": "id"}
 

@@ -30,7 +30,7 @@ from schemas.job.assets import (
 )
 from schemas.job.job import differing_keys
 from schemas.job.look import Recolour
-from schemas.scene.shape import Asset
+from schemas.scene.shape import Asset, MapSource
 from workers.assets.poses import PoseFile
 from workers.geometry.frames import add_up
 
@@ -80,6 +80,8 @@ class Catalogue:
     """Tables of camera poses by the name of their camera; the digest covers them too."""
     scenes: PoseFile | None = None
     """The table of scenes that the job names; the digest covers it too."""
+    maps: tuple[MapSource, ...] = ()
+    """Maps of light of the folder that `look.environment` names; the digest covers them too."""
     recolour: Recolour = "as_made"
     """Colours of built-in objects; the digest covers them too."""
     pictures: "Pictures" = field(default_factory=dict)

@@ -25,6 +25,7 @@ from schemas.errors import AssetSourceError, CaptureError, InputError, command_l
 from schemas.job.job import Job
 from schemas.job.look import RECOLOUR_VERSION
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
+from workers.assets.environment import open_maps
 from workers.assets.poses import open_poses
 from workers.assets.scene_tables import open_scenes
 from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW
@@ -165,7 +166,7 @@ def _list_inputs(path: Path) -> list[Path]:
 
 
 def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue:
-    """The job's catalogue; with folders of captures its digest covers every input file of theirs.
+    """The job's catalogue; its digest covers every file that the job names.
 
     `watch` is told now and then how far it is. Raises AssetSourceError that names the key of a folder that cannot be used.
     """
@@ -179,14 +180,16 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
 
         pictures = open_pictures(look, job_folder)
         further += [f"{key} {one.name} {one.sha256}" for key, some in pictures.items() for one in some]
+    around = job.look.environment  # also of tier flat: a study compares it with the path-traced tier
+    maps = () if around is None else open_maps(around.folder, job_folder)
+    further += [f"{source.name} {source.sha256}" for source in maps]
     if look.recolour != "as_made":
         further.append(f"recolour {look.model_dump_json(include={'recolour'})} {RECOLOUR_VERSION}")
     if further:
         whole = "\n".join([catalogue.digest, *further])
         digest = hashlib.sha256(whole.encode()).hexdigest()
-        catalogue = replace(
-            catalogue, poses=poses, scenes=scenes, pictures=pictures, recolour=look.recolour, digest=digest
-        )
+        catalogue = replace(catalogue, poses=poses, scenes=scenes, pictures=pictures, maps=maps)
+        catalogue = replace(catalogue, recolour=look.recolour, digest=digest)
     if job.captures is None or not job.captures.folders:
         return catalogue
     listings, folders = [], job.captures.folders

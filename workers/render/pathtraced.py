@@ -39,13 +39,12 @@ from schemas.base import Array, Pose
 from schemas.errors import InputError
 from schemas.job.views import Render
 from schemas.scene.scene import EffectPlan, Placed
-from schemas.scene.shape import Appearance, Light, Material, Part
+from schemas.scene.shape import LAMP_RAD, Appearance, Light, Material, Part, Surround
 from schemas.scene.view import Camera, GBuffer, Intrinsics
 from workers.geometry.camera import NEAR_M
 from workers.geometry.colour import HOLE_ALPHA, SRGB_STEPS, decode_srgb, encode_codes, has_holes
-from workers.geometry.frames import transform
+from workers.geometry.frames import UP, pose, rotation_about, transform
 from workers.geometry.pixels import fill_image
-from workers.render.raster.baking import LAMP_RAD
 from workers.render.raster.batches import MATTE_ROUGHNESS, texture_of
 from workers.render.raster.gbuffer import Renderer
 from workers.render.raster.lit_shaders import KNEE
@@ -71,36 +70,54 @@ It grows with the sine of the elevation: then HORIZON + 2/3 (ZENITH - HORIZON) m
 
 
 def lights_of(mi: ModuleType, appearance: Appearance) -> dict[str, Any]:
-    """Mitsuba's emitters by name. Half of the light samples go to the key light, half to the environment map."""
-    lamps = _lamps(appearance.lights[0]) if appearance.lights else []
-    return {f"key-{n}": lamp for n, lamp in enumerate(lamps)} | {"sky": _environment(mi, appearance)}
+    """Mitsuba's emitters by name. Each light with a disc has as many of the light samples as the environment map."""
+    glow = GLOW if appearance.surround is None else 0.0
+    discs = [light for n, light in enumerate(appearance.lights) if has_disc(light, n)]
+    lamps = [lamp for light in discs for lamp in _lamps(light, 1.0 - glow)]
+    return {f"key-{n}": lamp for n, lamp in enumerate(lamps)} | {"sky": _environment(mi, appearance, len(lamps))}
 
 
-def _lamps(light: Light) -> list[dict[str, Any]]:
+def has_disc(light: Light, number: int) -> bool:
+    """Whether a light is drawn as a disc: the key light is, and those that have a size; what a surround has is in its map."""
+    return not light.of_surround and (number == 0 or light.size_rad is not None)
+
+
+def _lamps(light: Light, share: float) -> list[dict[str, Any]]:
     """Distant lights. One of `color` gives a surface that faces it an irradiance of pi times `color`."""
-    irradiance = [math.pi * (1.0 - GLOW) * c / LAMPS for c in light.color]
+    irradiance = [math.pi * share * c / LAMPS for c in light.color]
     shine: dict[str, Any] = {"type": "directional", "irradiance": {"type": "rgb", "value": irradiance}}
-    return [shine | {"direction": (-towards).tolist()} for towards in lamp_directions(light.direction)]
+    spread = lamp_directions(light.direction, LAMP_RAD if light.size_rad is None else light.size_rad)
+    return [shine | {"direction": (-towards).tolist()} for towards in spread]
 
 
-def lamp_directions(direction: Array) -> Array:
-    """[LAMPS, 3] unit: spread evenly over a disc of `LAMP_RAD` around a direction, in a spiral (Vogel 1979)."""
+def lamp_directions(direction: Array, size_rad: float = LAMP_RAD) -> Array:
+    """[LAMPS, 3] unit: spread evenly over a disc of this angle around a direction, in a spiral (Vogel 1979)."""
     x = np.cross([0.0, 1.0, 0.0] if abs(direction[1]) < 0.9 else [1.0, 0.0, 0.0], direction)
     x /= np.linalg.norm(x)
     y = np.cross(direction, x)
     number = np.arange(LAMPS)
-    radius = math.tan(0.5 * LAMP_RAD) * np.sqrt((number + 0.5) / LAMPS)
+    radius = math.tan(0.5 * size_rad) * np.sqrt((number + 0.5) / LAMPS)
     turn = number * math.pi * (3.0 - math.sqrt(5.0))
     spread = direction + (radius * np.cos(turn))[:, None] * x + (radius * np.sin(turn))[:, None] * y
     return np.asarray(spread / np.linalg.norm(spread, axis=1, keepdims=True), np.float64)
 
 
-def _environment(mi: ModuleType, appearance: Appearance) -> dict[str, Any]:
-    picture = sky_picture(appearance, sky_directions(np.arange(SKY_PX[1]) / (SKY_PX[1] - 1.0)))
+def _environment(mi: ModuleType, appearance: Appearance, lamps: int) -> dict[str, Any]:
     # Mitsuba's map has y up and -z at its left edge; ours has z up and -x there.
-    turn = mi.ScalarTransform4f(np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]))
-    around = {"type": "envmap", "bitmap": mi.Bitmap(picture.astype(np.float32)), "to_world": turn}
-    return around | {"sampling_weight": float(LAMPS) if appearance.lights else 1.0}
+    turn = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    if appearance.surround is None:
+        picture = sky_picture(appearance, sky_directions(np.arange(SKY_PX[1]) / (SKY_PX[1] - 1.0)))
+    else:
+        picture = _from_pole_to_pole(appearance.surround)
+        turn = pose(rotation_about(UP, appearance.surround.turn_rad), np.zeros(3)) @ turn
+    around = {"type": "envmap", "bitmap": mi.Bitmap(picture.astype(np.float32)), "to_world": mi.ScalarTransform4f(turn)}
+    return around | {"sampling_weight": float(LAMPS) if lamps else 1.0}
+
+
+def _from_pole_to_pole(surround: Surround) -> Array:
+    """[H + 1, 2 H, 3]: the map, with its first row the zenith itself and its last the nadir, as Mitsuba has it."""
+    rows = surround.scale * surround.radiance.astype(np.float64)
+    return np.concatenate([rows[:1], 0.5 * (rows[:-1] + rows[1:]), rows[-1:]])
 
 
 def sky_picture(appearance: Appearance, directions: Array) -> Array:
@@ -111,7 +128,7 @@ def sky_picture(appearance: Appearance, directions: Array) -> Array:
     level = np.sqrt(1.0 - sine**2)
     cell_sr = level * (4.0 * math.pi / level.sum())
     for number, light in enumerate(appearance.lights):
-        share, width = (1.0, FILL_RAD) if number else (GLOW, GLOW_RAD)
+        share, width = (GLOW, GLOW_RAD) if has_disc(light, number) else (1.0, FILL_RAD)
         towards = directions @ light.direction
         own_side = (sine > 0.0) == (light.direction[2] > 0.0)
         lobe = np.where(own_side, np.exp((towards - 1.0) / width**2)[..., None], 0.0)
@@ -314,7 +331,9 @@ class Tracer:
         built = self.build(things, appearance, effects)
         kind = "volpath" if built.clear else "path"
         bounces = render.path_bounces if effects.runs("global_illumination") else 1
-        integrator = {"type": kind, "max_depth": bounces + 1, "rr_depth": ROULETTE_DEPTH, "hide_emitters": True}
+        integrator = {"type": kind, "max_depth": bounces + 1, "rr_depth": ROULETTE_DEPTH}
+        shown = appearance.surround is not None and appearance.surround.shown and appearance.backdrop is None
+        integrator |= {"hide_emitters": not shown}
         traced = {"sensor": self.sensor(camera), "integrator": self._mi.load_dict(integrator), "seed": seed}
         image = self._mi.render(built.scene, spp=round_up_samples(render.path_samples), **traced)
         pixels = np.array(image, np.float64)

@@ -31,6 +31,8 @@ class Stream(IntEnum):
     ORBIT = 18
     MORE = 19
     MIRROR = 20
+    LIGHTS = 21
+    ENVIRONMENT = 22
     SURROUNDINGS = 23
     CLUTTER = 24
     GIVEN = 27

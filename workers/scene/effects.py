@@ -184,6 +184,8 @@ BRANCHES = {
     "backdrop": "background",
     "room": "room",
     "clutter": "clutter",
+    "lights": "lights",
+    "environment": "environment",
 }
 """Effects of surroundings, and the branch of `look` that asks for each."""
 

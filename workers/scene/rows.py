@@ -168,7 +168,10 @@ def file_columns(file: EncodedFile) -> Row:
     return {"path": file.path, "bytes": len(file.data), "sha256": file.sha256}
 
 
-SURROUNDINGS = ("floor", "floor_tile_m", "table", "table_tile_m", "background", "room_m")
+SURROUNDINGS = (
+    *("floor", "floor_tile_m", "table", "table_tile_m", "background", "room_m"),
+    *("lights", "environment", "environment_deg"),
+)
 
 
 def surroundings_column(scene: Scene, job: Job) -> Row | None:

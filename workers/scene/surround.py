@@ -1,13 +1,16 @@
 """What `look` puts around the objects of a scene that is planned, from streams of its own, so that nothing else moves."""
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 from schemas.job.job import Job
 from schemas.job.look import Look, Surface
 from schemas.scene.scene import ScenePlan
-from schemas.scene.shape import Shape
+from schemas.scene.shape import Appearance, Shape
 from workers.assets.catalogue import Catalogue
+from workers.assets.environment import relight
+from workers.assets.lights import describe_lights, draw_environment, draw_lights
 from workers.assets.pictures import load_picture
 from workers.assets.surroundings import Coat, build_room, cover_floor, cover_table, draw_coat, require_table_inside
 from workers.scene.chance import SceneChance, Stream
@@ -32,7 +35,8 @@ def surround(job: Job, look: Look, catalogue: Catalogue, chance: SceneChance, pl
 
     Raises StartError where the table does not fit into the room.
     """
-    drawn: dict[str, object] = {}
+    appearance, drawn = light_scene(look, catalogue, chance, plan.appearance, plan.ground is not None)
+    plan = replace(plan, appearance=appearance)
     if plan.ground is not None:
         ground = plan.ground
         if look.floor is not None:
@@ -59,6 +63,20 @@ def surround(job: Job, look: Look, catalogue: Catalogue, chance: SceneChance, pl
         drawn["background"] = picture.name
         plan = replace(plan, appearance=replace(plan.appearance, backdrop=load_picture(picture)))
     return replace(plan, surroundings=drawn) if drawn or look.clutter is not None else plan
+
+
+def light_scene(
+    look: Look, catalogue: Catalogue, chance: SceneChance, base: Appearance, shown: bool
+) -> tuple[Appearance, dict[str, object]]:
+    """The appearance in the light that is asked for, and what was drawn of it. `shown`: as of `relight`."""
+    lights, around, drawn = None, None, dict[str, object]()
+    if look.lights is not None:
+        lights = draw_lights(chance.stream(Stream.LIGHTS), look.lights)
+        drawn["lights"] = describe_lights(lights)
+    if look.environment is not None:
+        around = draw_environment(chance.stream(Stream.ENVIRONMENT), look.environment, catalogue.maps)
+        drawn |= {"environment": around.source.name, "environment_deg": math.degrees(around.turn_rad)}
+    return relight(base, lights, around, shown), drawn
 
 
 def lay_floor(surface: Surface, catalogue: Catalogue, chance: SceneChance, floor: Shape) -> tuple[Shape, Coat]:

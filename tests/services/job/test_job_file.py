@@ -431,6 +431,8 @@ OFF = {
     ),
     "look.table": ({"folder": "x"}, {"render": {"rgb": False}}, "render.rgb is false"),
     "look.background": ("x", {"render": {"tier": "flat"}}, "render.tier is flat"),
+    "look.lights": ({}, {"render": {"tier": "flat"}}, "render.tier is flat"),
+    "look.environment": ({}, {"render": {"rgb": False}}, "render.rgb is false"),
 }
 ON = {
     "render": {"tier": "pathtraced", "path_samples": 4, "path_bounces": 2},

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from schemas.base import Range
 from schemas.errors import AssetSourceError, JobError, StartError, ViewError
 from schemas.job.job import job_digest
 from schemas.job.look import Palette, Room, Surface
@@ -20,7 +21,7 @@ from tests.effects.cases import ABOVE_THE_HORIZON, PICTURES
 from tests.effects.scenes import Made, Setting, facts_of, make
 from workers.assets.pictures import KEPT_PX, LARGEST_PX, load_picture, open_pictures
 from workers.assets.recolour import palette_rows, recolour_colour, recolour_texture
-from workers.assets.surroundings import cover_floor, cover_table, draw_coat
+from workers.assets.surroundings import build_room, cover_floor, cover_table, draw_coat
 from workers.capture.results import open_sources
 from workers.geometry.camera import unproject
 from workers.geometry.pixels import fill_image
@@ -33,7 +34,7 @@ def hue_of(colours: np.ndarray) -> np.ndarray:
 
 
 def test_each_hue_goes_into_the_nearest_range_in_order_greys_stay_and_saturation_is_bounded():
-    palette = Palette(hue=((0.1, 0.2), (0.55, 0.6), (0.95, 1.0)), saturation=(0.2, 0.6))  # type: ignore[arg-type]
+    palette = Palette(hue=((0.1, 0.2), (0.55, 0.6), (0.95, 1.0)), saturation=(0.2, 0.6))
     rows, hues = palette_rows(palette), np.linspace(0.0, 1.0, 500, endpoint=False)
     assert rows is not None
     for saturation, value in ((0.9, 0.8), (0.15, 0.5)):
@@ -88,7 +89,7 @@ def test_colour_of_surroundings_changes_rgb_alone_and_no_row_but_what_was_drawn(
 
 
 def test_pictures_repeat_after_their_metres_on_every_face_and_no_face_is_moved():
-    plan, surface = facts_of(Setting({})).plan, Surface(folder=PICTURES, tile_m=(0.3, 0.5))  # type: ignore[arg-type]
+    plan, surface = facts_of(Setting({})).plan, Surface(folder=PICTURES, tile_m=(0.3, 0.5))
     look = validate_job({"name": "x", "look": {"floor": {"folder": PICTURES}}}, "x").look
     coat = draw_coat(surface, open_pictures(look, Path())["look.floor.folder"], RNG(3), 0.9)
     texture = coat.material.texture
@@ -120,7 +121,7 @@ def test_a_room_is_seen_where_rays_meet_it_and_its_window_is_on_the_key_lights_s
     room = {"room": {"size_m": [6.0, 6.4], "height_m": [1.2, 1.4]}}
     made = make(Setting({**far, "look": room}))  # raises where depth or masks are not those of rays
     view, (row,) = made.scene.pairs[0].input, made.rows["scenes"]
-    length, width, height = row["surroundings"]["room_m"]  # type: ignore[index]
+    length, width, height = row["surroundings"]["room_m"]
     assert view.region is not None
     pixels = np.nonzero((view.region == REGION_FLOOR) & (view.depth > 0))
     points = unproject(*pixels, view.depth[pixels] / 5000.0, view.camera.intrinsics) @ view.camera.T_world_cam[:3, :3].T
@@ -129,11 +130,12 @@ def test_a_room_is_seen_where_rays_meet_it_and_its_window_is_on_the_key_lights_s
     assert up.any() and points[:, 2].max() < height + 0.01
     outside = np.abs(points[up, :2]) - 0.5 * np.array([length, width])
     assert (np.abs(outside).min(axis=1) < 0.15).all() and outside.max() < 0.12
-    ground = made.scene.plan.ground
-    assert ground is not None and ground.walls is not None
-    (pane,) = (part for part in ground.walls.shape.parts if part.name == "window")
-    light, middle = made.scene.plan.appearance.lights[0].direction[:2], pane.vertices.mean(axis=0)[:2]
-    assert middle @ light / np.linalg.norm(middle) / np.linalg.norm(light) > 0.8
+    for azimuth in np.linspace(0.1, 2.0 * np.pi, 16):
+        light = np.array([np.cos(azimuth), np.sin(azimuth), 1.0])
+        walls = build_room(Room(size_m=Range(6.0, 6.0)), light, RNG(7))
+        (pane,) = (part for part in walls.shape.parts if part.name == "window")
+        middle = pane.vertices.mean(axis=0)[:2]
+        assert middle @ light[:2] / np.linalg.norm(middle) > 0.97  # a corner's is 12 degrees aside
     plain = make(Setting(far)).scene.pairs[0].input
     assert plain.region is not None
     things = plain.region > REGION_FLOOR
@@ -166,7 +168,7 @@ def test_clutter_is_in_images_masks_and_depth_and_has_no_row():
     assert regions & set(ids)
     for table in ("views", "objects", "scenes"):
         for row in made.rows[table]:
-            assert not {row.get("region_id"), *(body["region_id"] for body in row.get("bodies", ()))} & set(ids)  # type: ignore[attr-defined]
+            assert not {row.get("region_id"), *(body["region_id"] for body in row.get("bodies", ()))} & set(ids)
     assert len(made.rows["objects"]) == len(plain.rows["objects"])
     assert {path.split("/")[-1] for path in made.files} >= {path.split("/")[-1] for path in plain.files}
     starts = [made.scene.plan.objects, plain.scene.plan.objects]

@@ -5,7 +5,7 @@
 **Level maps.** A level is a horizontal plane: the floor, with a map around the table, and the plane that objects stand on,
 with a map around the objects. Each map is made from elevations on a grid of `LEVEL_PX` square. RGBA8: share of the sky seen from
 the level, share seen from the top of what stands there, elevation of that top in units of the box, and share of the key light.
-On the floor the last is the table's shadow, with an edge as wide as a lamp of `LAMP_RAD` makes it from a table's height.
+On the floor the last is the table's shadow, with an edge as wide as the lamp makes it from a table's height.
 
 **Sky.** On a square grid, things are columns from `under` to `top` above the level. Seen from a point, in one horizontal
 direction, columns hide the sky between two elevation angles a < b, a share sin^2 b - sin^2 a of the cosine-weighted sky (integral
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.scene.scene import Placed
+from schemas.scene.shape import LAMP_RAD
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled_for
 from workers.geometry.mesh import bounds_of
@@ -117,14 +118,17 @@ LEVEL_PX = 56
 MAP_PX = 192
 """Side of a level map, fine enough for the edges of shadows: 13 mm a pixel under a large table, 3 mm about an object."""
 
-LAMP_RAD = 0.06
-"""Angle across the key light, seen from the scene: a softbox of 12 cm at 2 m."""
+SOFT_M = 0.1
+"""Radius of the shadow's edge on tables and objects by the lamp's angle: half of it over 20 cm."""
 
-SOFT_M = 0.006
-"""Radius of the shadow's edge on tables and objects: a lamp of `LAMP_RAD` over 20 cm."""
+WIDEST_RAD = 0.25
+"""The edge of a wider lamp's shadow is drawn as this one's: four taps would show as four shadows."""
 
 BIAS_M = 0.0015
 """A surface no deeper than this below the shadow map's depth is lit: half a pixel of the map, seen slantwise."""
+
+STEEP_SINE = 0.6
+"""Sine of the key light's elevation below which a level's depth changes by more than `BIAS_M` in a pixel of the map."""
 
 LOWEST_SINE = 0.2
 """Least sine of the key light's elevation for which a level map reaches to the end of the shadows."""
@@ -227,7 +231,9 @@ def _encode_shares(shares: NDArray[np.float32], codes: NDArray[np.uint8]) -> Non
                 codes[row, column, channel] = np.uint8(np.int32(np.rint(most * share)))
 
 
-def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Array) -> NDArray[np.uint8]:
+def level_shadow(
+    depth: NDArray[np.float32], light: Box, level: Box, towards: Array, lamp_rad: float = LAMP_RAD
+) -> NDArray[np.uint8]:
     """[MAP_PX, MAP_PX] uint8: share of the key light on a level, from the shadow map's depth [S, S].
 
     A shadow's edge is as wide as the lamp's angle times the distance to the caster: sharp where a thing stands, soft where
@@ -239,11 +245,13 @@ def level_shadow(depth: NDArray[np.float32], light: Box, level: Box, towards: Ar
     u, v, z = _place_level(light.unit_from_world, columns, rows, float(low[2]), np.float32(len(depth)))
     nearest = np.asarray(cv2.remap(depth, u, v, cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, 1.0), np.float32)
     away_m = (z - nearest) * np.float32(light.bounds[1, 2] - light.bounds[0, 2])
-    dark = ((away_m > np.float32(BIAS_M)) & (nearest < 1.0)).astype(
+    pixel_m, sine = float((light.bounds[1] - light.bounds[0])[:2].max()) / len(depth), float(towards[2])
+    slant_m = pixel_m * math.sqrt(1.0 - sine**2) / max(sine, 0.01) if sine < STEEP_SINE else 0.0
+    dark = ((away_m > np.float32(max(BIAS_M, slant_m))) & (nearest < 1.0)).astype(
         np.float32
     )  # elsewhere the level itself is nearest to it
     farthest_m = float((high[2] - low[2]) / max(float(towards[2]), LOWEST_SINE))
-    wide_px = max(0.3 * LAMP_RAD * farthest_m / float(step[0]), 1.0)
+    wide_px = max(0.3 * lamp_rad * farthest_m / float(step[0]), 1.0)
     narrow = cv2.GaussianBlur(dark, (0, 0), 0.8)
     wide = cv2.GaussianBlur(dark, (0, 0), wide_px)
     away = cv2.GaussianBlur(away_m * dark, (0, 0), wide_px)
@@ -291,7 +299,11 @@ def triangles_of(things: Sequence[Placed]) -> Triangles:
     return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
 
 
-def shadow_filter(light: Box) -> tuple[float, float, float]:
+def shadow_filter(light: Box, lamp_rad: float = LAMP_RAD) -> tuple[float, float, float]:
     """(filter radius, depth bias, pixel size) of the shadow map, in units of the light's box."""
     size = light.bounds[1] - light.bounds[0]
-    return SOFT_M / float(math.sqrt(size[0] * size[1])), BIAS_M / float(size[2]), 1.0 / SHADOW_PX
+    return (
+        SOFT_M * min(lamp_rad, WIDEST_RAD) / float(math.sqrt(size[0] * size[1])),
+        BIAS_M / float(size[2]),
+        1.0 / SHADOW_PX,
+    )

@@ -19,6 +19,7 @@ from schemas.scene.shape import REGION_FLOOR, REGION_TABLE, Appearance, Shape
 from schemas.scene.view import Intrinsics
 from workers.geometry.camera import NEAR_M
 from workers.geometry.frames import transform
+from workers.geometry.irradiance import turn_polynomials
 from workers.render.raster.batches import Cover, is_matte, seen_ranges, texture_of
 from workers.render.raster.buffers import Uploaded, UploadedShape
 from workers.render.raster.shaders import MAX_LIGHTS, Variant
@@ -85,14 +86,21 @@ class Program:
         gl.glUniform3fv(self._location("light_towards"), count, lights.towards)
         gl.glUniform3fv(self._location("light_color"), count, lights.color)
 
-    def set_ambience(self, appearance: Appearance, T_cam_world: Pose) -> None:
-        """Set, for tier raster, the world's up, the light from below, the sheen, and the units of the light maps."""
+    def set_ambience(self, view: "RenderPass") -> None:
+        """Set, for tier raster, the world's up, the light from around, the sheen, and the units of the light maps."""
         gl = self._gl
-        gl.glUniform3f(self._location("up"), *T_cam_world[:3, 2])
-        gl.glUniform3f(self._location("below"), *appearance.below)
-        gl.glUniform1f(self._location("sheen"), appearance.sheen)
+        gl.glUniform3f(self._location("up"), *view.T_cam_world[:3, 2])
+        gl.glUniform3f(self._location("below"), *view.appearance.below)
+        gl.glUniform1f(self._location("sheen"), view.appearance.sheen)
+        if view.around is not None:
+            gl.glUniform3fv(self._location("around"), len(view.around), view.around)
         gl.glUniform1i(self._location("level_map"), LEVEL_UNIT)
         gl.glUniform1i(self._location("shadow_map"), SHADOW_UNIT)
+
+    def set_sky(self, map_from_cam: Array, scale: float) -> None:
+        """Set the turn [3, 3] from the optical frame to that of a map, and the factor of its light (sky.py)."""
+        self._gl.glUniformMatrix3fv(self._location("map_from_cam"), 1, True, map_from_cam.astype(np.float32))
+        self._gl.glUniform1f(self._location("scale"), scale)
 
     def set_plain(self, srgb: NDArray[np.float32]) -> None:
         """Set the colour [3] of what has one (ground.py)."""
@@ -196,6 +204,13 @@ class RenderPass:
             towards[i], color[i] = self.T_cam_world[:3, :3] @ light.direction, light.color
         return PlacedLights(self.appearance.ambient, towards, color)
 
+    @cached_property
+    def around(self) -> NDArray[np.float32] | None:
+        """[18, 3]: the terms of the surround as the camera sees it; None without one."""
+        if not self.raster or self.appearance.surround is None:
+            return None
+        return turn_polynomials(self.appearance.surround.terms, self.T_cam_world[:3, :3]).astype(np.float32)
+
     def shift(self, x_px: float, y_px: float) -> "RenderPass":
         """The same with every pixel's centre moved by (x_px, y_px)."""
         return replace(self, k=self.k.model_copy(update={"cx": self.k.cx - x_px, "cy": self.k.cy - y_px}))
@@ -255,7 +270,9 @@ def sort_draws(
                 if matte:
                     matte = level if raster else textured or is_plain(thing.shape, view)
                 look = (view.color, textured, batch.few_triangles, matte, lights, raster)
-                variant = Variant(*look, ground, level, view.labels, cutout, planar, ground and not ground_z)
+                variant = Variant(
+                    *look, ground, level, view.labels, cutout, planar, ground and not ground_z, view.around is not None
+                )
                 by_variant.setdefault(variant, []).append(Draw(thing, T_cam_shape, batch, culls, first, count))
     return by_variant
 

@@ -63,6 +63,7 @@ from workers.render.raster.ground import TILE_PX, find_ground, level_plane, plai
 from workers.render.raster.light_maps import LightMaps
 from workers.render.raster.lit_shaders import EMPTY_FRAGMENT
 from workers.render.raster.shaders import COUNT_VERTEX, Variant, label_sources
+from workers.render.raster.sky import Sky
 
 LAST_NUMBER = 255
 """The greatest number that a stencil of eight bits holds."""
@@ -155,6 +156,7 @@ class Renderer:
         self._ranked: tuple[Sequence[Placed], dict[int, int]] = (), {}
         self._light_maps = LightMaps(gl, self._shapes)
         self._colour_target = ColourTarget(gl)
+        self._sky = Sky(gl)
         self._rgba = np.empty((0, 0, 4), np.uint8)
         self._counter = PixelCounter(gl)
         for setting in (gl.GL_CULL_FACE, gl.GL_BLEND, gl.GL_DITHER, gl.GL_MULTISAMPLE):
@@ -248,7 +250,7 @@ class Renderer:
             if view.color:
                 program.set_light(view.lights)
             if view.raster:
-                program.set_ambience(view.appearance, view.T_cam_world)
+                program.set_ambience(view)
             for draw in draws:
                 if view.raster:
                     self._light_maps.bind(program, draw.thing)
@@ -262,6 +264,8 @@ class Renderer:
                 self._draw(draw, variant.textured)
         self._gl.glColorMaski(1, *([True] * 4))
         self._gl.glDisable(self._gl.GL_CULL_FACE)
+        if view.raster and (surround := view.appearance.surround) is not None and surround.shown:
+            self._sky.draw(view, surround)
 
     def _rank(self, things: Sequence[Placed]) -> dict[int, int]:
         """The ranks of `rank_regions`, found once for the views of one scene."""

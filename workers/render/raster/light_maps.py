@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Pose
 from schemas.scene.scene import Placed
-from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, Appearance
+from schemas.scene.shape import LAMP_RAD, REGION_FIRST_OBJECT, REGION_FLOOR, Appearance
 from workers.render.raster import baking
 from workers.render.raster.baking import SHADOW_PX, Box
 from workers.render.raster.buffers import ShapeStore
@@ -36,6 +36,7 @@ class Baked:
     light: Box | None = None
     floor: Box | None = None
     stand: Box | None = None
+    lamp_rad: float = LAMP_RAD
 
 
 class LightMaps:
@@ -96,7 +97,8 @@ class LightMaps:
         objects = [thing for thing in things if thing.region_id >= REGION_FIRST_OBJECT]
         if not casters or not appearance.lights or not (shadows or occlusion):
             return Baked()
-        towards = appearance.lights[0].direction
+        key = appearance.lights[0]
+        towards, lamp_rad = key.direction, LAMP_RAD if key.size_rad is None else key.size_rad
         below = [thing for thing in casters if thing not in objects]
         lower, upper = baking.triangles_of(below or objects), baking.triangles_of(objects) if objects else None
         vertices = lower[0] if upper is None else np.concatenate([lower[0], upper[0]])
@@ -108,16 +110,16 @@ class LightMaps:
             if not occlusion:
                 pixels[..., :2] = 255
             if light is not None and depth is not None:
-                pixels[..., 3] = baking.level_shadow(depth, light, level, towards)
+                pixels[..., 3] = baking.level_shadow(depth, light, level, towards, lamp_rad)
             self._upload(texture, pixels)
 
         floor = baking.level_box(vertices, 0.0, towards, baking.FLOOR_REACH_M)
         bake_level(self._floor, lower, floor, True)
         if upper is None:
-            return Baked(light, floor)
+            return Baked(light, floor, None, lamp_rad)
         stand = baking.level_box(upper[0], float(upper[0][:, 2].min()), towards, baking.STAND_REACH_M)
         bake_level(self._stand, upper, stand, False)
-        return Baked(light, floor, stand)
+        return Baked(light, floor, stand, lamp_rad)
 
     def _place(self, thing: Placed) -> MapPlacement:
         """Where a thing lies in the maps that light it."""
@@ -128,7 +130,10 @@ class LightMaps:
         shadow_from_shape, softness = np.diag([0.0, 0.0, 0.0, 1.0]), (0.0, 1.0, 0.0)
         linear_inverse: NDArray = np.zeros((3, 3))
         if light is not None:
-            shadow_from_shape, softness = light.unit_from_world @ thing.T_world_shape, baking.shadow_filter(light)
+            shadow_from_shape, softness = (
+                light.unit_from_world @ thing.T_world_shape,
+                baking.shadow_filter(light, self._baked.lamp_rad),
+            )
             linear_inverse = np.linalg.inv(shadow_from_shape[:3, :3])
         matrices = (level_from_shape, shadow_from_shape, linear_inverse.T)
         on_level, on_shadow, normal = (matrix.astype(np.float32) for matrix in matrices)

@@ -16,10 +16,35 @@ KNEE = 0.8
 ASIDE_M = 0.014
 """Distance in front of a wall at which its level map is looked up: somewhat more than a pixel of the elevation grid."""
 
+TONE = """
+// Tone curve: linear below the knee, approaching 1 above it.
+vec3 tone_map(vec3 c) {
+    vec3 over = max(c - KNEE, 0.0);
+    return min(c, KNEE) + (1.0 - KNEE) * over / ((1.0 - KNEE) + over);
+}
+""".replace("KNEE", str(KNEE))
+
+AROUND = """
+// Radiance of a white surface by its normal (workers/geometry/irradiance.py); of what a surface mirrors too: a reflection as
+// broad as Lambert's lobe.
+uniform vec3 around[18];
+
+vec3 around_of(vec3 n) {
+    vec3 s = n * n, m = n.xyx * n.yzz;
+    vec3 sum = around[0] * n.x + around[1] * n.y + around[2] * n.z;
+    sum += s.x * (around[3] * s.x + around[4] * m.x + around[5] * m.z + around[6] * s.y + around[7] * m.y + around[8] * s.z);
+    sum += s.y * (around[9] * m.x + around[10] * m.z + around[13] * s.y + around[14] * m.y + around[15] * s.z);
+    return max(sum + s.z * (around[11] * m.x + around[12] * m.z + around[16] * m.y + around[17] * s.z), 0.0);
+}
+"""
+
 LIT_VERTEX = """
 uniform mat4 level_from_shape;     // to (u, v, elevation above the level in units of its map)
 uniform vec3 up;                   // the world's, in the optical frame
 uniform vec3 below;
+#if SURROUND
+AROUND_TERMS
+#endif
 out vec3 v_level;
 #if !LEVEL
 uniform mat4 shadow_from_shape;    // to (u, v, depth) of the shadow map
@@ -47,7 +72,7 @@ void pass_light() {
     v_below = below;
 #endif
 }
-""".replace("ASIDE_M", str(ASIDE_M))
+""".replace("ASIDE_M", str(ASIDE_M)).replace("AROUND_TERMS", AROUND)
 
 LIT_FRAGMENT = """
 in vec3 v_level;
@@ -59,6 +84,12 @@ uniform vec3 up;
 uniform vec3 below;
 #define v_up up
 #define v_below below
+#endif
+#if SURROUND
+AROUND_TERMS
+#define AROUND_OF(direction) around_of(direction)
+#else
+#define AROUND_OF(direction) mix(v_below, v_ambient, 0.5 + 0.5 * dot(direction, v_up))
 #endif
 uniform sampler2D level_map;
 
@@ -91,12 +122,7 @@ float key_share(float on_map, float facing) {
 }
 #endif
 
-// Tone curve: linear below the knee, approaching 1 above it.
-vec3 tone_map(vec3 c) {
-    vec3 over = max(c - KNEE, 0.0);
-    return min(c, KNEE) + (1.0 - KNEE) * over / ((1.0 - KNEE) + over);
-}
-
+TONE
 // What arrives of the sky and of the other lights, and of the key light; `facing`: the cosine of the latter's direction.
 vec2 arriving(float facing) {
 #if LEVEL
@@ -118,14 +144,14 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
     vec2 arrives = arriving(dot(normal, v_light_towards[0]));
     float open = arrives.x, lit = arrives.y;
     vec3 diffuse = albedo * (1.0 - metallic);
-    vec3 mirror = mix(vec3(0.04), albedo, metallic);
-    vec3 around = mix(v_below, v_ambient, 0.5 + 0.5 * dot(normal, v_up)) * open;
+    vec3 mirror = mix(vec3(DIELECTRIC(roughness)), albedo, metallic);
+    vec3 around = AROUND_OF(normal) * open;
     float facing = clamp(dot(normal, towards_eye), 0.0, 1.0), miss_eye = 1.0 - facing;
     float grazing = miss_eye * miss_eye * miss_eye * miss_eye * miss_eye * (1.0 - roughness) * sheen;
     mirror += (1.0 - mirror) * grazing;
     float width = max(roughness * roughness * roughness * roughness, 0.002);
     vec3 bounced = 2.0 * dot(normal, towards_eye) * normal - towards_eye;
-    vec3 sum = around * diffuse + mix(v_below, v_ambient, 0.5 + 0.5 * dot(bounced, v_up)) * open * mirror;
+    vec3 sum = around * diffuse + AROUND_OF(bounced) * open * mirror;
     for (int i = 0; i < LIGHTS; ++i) {
         float reach = max(dot(normal, v_light_towards[i]), 0.0) * (i == 0 ? lit : open);
         float miss = 1.0 - dot(bounced, v_light_towards[i]);
@@ -135,7 +161,7 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
     return sum;
 }
 #endif
-""".replace("KNEE", str(KNEE))
+""".replace("TONE", TONE).replace("AROUND_TERMS", AROUND)
 
 CAST_VERTEX = """
 #version 410 core
@@ -157,6 +183,25 @@ void main() {
     gl_Position = vec4(corner, 0.0, 1.0);
 }
 """
+
+SKY_VERTEX = MASK_VERTEX.replace("0.0, 1.0)", "-1.0, 1.0)")
+"""The same triangle infinitely far away."""
+
+SKY_FRAGMENT = """
+const float PI = 3.14159265;
+uniform vec4 view;                 // cx, cy, 1 / fx, 1 / fy
+uniform mat3 map_from_cam;
+uniform float scale;
+uniform sampler2D sky;
+layout(location = 0) out vec4 out_color_region;
+
+TONE
+void main() {
+    vec3 ray = normalize(map_from_cam * vec3((gl_FragCoord.xy - view.xy) * view.zw, 1.0));
+    vec2 at = vec2(0.5 - atan(ray.y, ray.x) / (2.0 * PI), acos(clamp(ray.z, -1.0, 1.0)) / PI);
+    out_color_region = vec4(encode_srgb(tone_map(scale * textureLod(sky, at, 0.0).rgb)), 0.0);
+}
+""".replace("TONE", TONE)
 
 MASK_FRAGMENT = """
 #version 410 core
@@ -198,12 +243,14 @@ const float sheen = 1.0;
 
 void light_plane() {
     vec3 normal = v_plane.w > 0.0 ? -v_plane.xyz : v_plane.xyz;    // towards the eye
-#if RASTER
+#if SURROUND
+    vec3 around = around_of(normal);
+#elif RASTER
     vec3 around = mix(below, ambient, 0.5 + 0.5 * dot(normal, up));
 #else
     vec3 around = ambient;
 #endif
-    vec3 diffuse = albedo_roughness.rgb * (1.0 - normal_metallic.w), mirror = 0.04 * around;
+    vec3 diffuse = albedo_roughness.rgb * (1.0 - normal_metallic.w), mirror = DIELECTRIC(albedo_roughness.w) * around;
     for (int i = RASTER; i < LIGHTS; ++i) around += light_color[i] * max(dot(normal, light_towards[i]), 0.0);
     v_plane_open = diffuse * around;
 #if RASTER
@@ -216,7 +263,8 @@ void light_plane() {
     float width = max(roughness * roughness * roughness * roughness, 0.002);
     v_ambient = ambient;
     v_tinted = albedo_roughness.rgb * metallic;
-    v_gloss = vec4(0.04 * (1.0 - metallic), (1.0 - roughness) * sheen, 0.5 + 0.5 / width, dot(normal, light_towards[0]));
+    float untinted = DIELECTRIC(roughness) * (1.0 - metallic);
+    v_gloss = vec4(untinted, (1.0 - roughness) * sheen, 0.5 + 0.5 / width, dot(normal, light_towards[0]));
     for (int i = 0; i < LIGHTS; ++i) {
         float cosine = dot(normal, light_towards[i]);
         v_lobe[i] = (0.5 - 0.5 / width) * (light_towards[i] - 2.0 * cosine * normal);
@@ -269,7 +317,11 @@ vec3 shade_plane(vec3 tint, vec3 ray, float facing) {
     vec2 arrives = arriving(v_gloss.w);
     float open = arrives.x, lit = arrives.y, miss_eye = 1.0 - facing;
     mirror += (1.0 - mirror) * (miss_eye * miss_eye * miss_eye * miss_eye * miss_eye * v_gloss.y);
+#if SURROUND
+    vec3 shine = around_of(ray - 2.0 * dot(v_plane.xyz, ray) * v_plane.xyz) * open;
+#else
     vec3 shine = mix(v_below, v_ambient, 0.5 + 0.5 * dot(v_mirrored_up, ray)) * open;
+#endif
     vec3 matte = v_plane_open * open + v_plane_key * lit;
 #else
     const float open = 1.0, lit = 1.0;

@@ -8,7 +8,15 @@ flat inputs where triangles are few, uniforms where they are many.
 
 from typing import NamedTuple
 
-from workers.render.raster.lit_shaders import LIT_FRAGMENT, LIT_VERTEX, PLANE_FRAGMENT, PLANE_VERTEX
+from workers.render.raster.batches import MATTE_ROUGHNESS
+from workers.render.raster.lit_shaders import (
+    LIT_FRAGMENT,
+    LIT_VERTEX,
+    PLANE_FRAGMENT,
+    PLANE_VERTEX,
+    SKY_FRAGMENT,
+    SKY_VERTEX,
+)
 
 GRAZING = 0.01
 """Cosine of incidence below which a face's plane does not determine z."""
@@ -41,6 +49,8 @@ class Variant(NamedTuple):
     """Each face has the normal of its plane and one material, so that most of its light is found once: of few triangles."""
     known_z: bool = False
     """Its z is not drawn, as it is computed from its plane (ground.py): for `ground` only."""
+    surround: bool = False
+    """Lit from around by a map: for `raster` only. As the path tracer has it, what is rough mirrors nothing then."""
 
     @property
     def plain(self) -> bool:
@@ -277,7 +287,14 @@ def label_sources(variant: Variant, hardware: bool) -> tuple[str, str]:
     choices = {**variant._asdict(), "plain": variant.plain}
     head = "#version 410 core\n" + "".join(f"#define {name.upper()} {int(v)}\n" for name, v in choices.items())
     head += f"#define UNFUSED {'precise' if hardware else ''}\n"
+    shine = f"((roughness) < {MATTE_ROUGHNESS} ? 0.04 : 0.0)" if variant.surround else "0.04"
+    head += f"#define DIELECTRIC(roughness) {shine}\n"
     vertex = _VERTEX.replace("LIT_VERTEX", LIT_VERTEX).replace("PLANE_VERTEX", PLANE_VERTEX)
     fragment = _FRAGMENT.replace("LIT_FRAGMENT", LIT_FRAGMENT).replace("PLANE_FRAGMENT", PLANE_FRAGMENT)
     fragment = fragment.replace("GRAZING_COSINE", str(GRAZING))
     return head + _ENCODE_SRGB + vertex, head + _ENCODE_SRGB + fragment
+
+
+def sky_sources() -> tuple[str, str]:
+    """(vertex, fragment) shader of the picture behind all surfaces."""
+    return SKY_VERTEX, "#version 410 core\n#define RASTER 1\n" + _ENCODE_SRGB + SKY_FRAGMENT
