@@ -159,7 +159,13 @@ def _body(scene_id: int, region: int, category: str, instance: str) -> dict[str,
     return (
         {"region_id": region, "category": category, "instance_id": instance, "source": "procedural"}
         | {"object_scale": 0.25, "T_world_obj": matrix_of(scene_id, 1 if region == 3 else region)}
-        | {"redraws": scene_id % 3, **_rest(scene_id), "mass_kg": 0.5, "com": [0.01 * region, 0.0, 0.8]}
+        | {
+            "redraws": scene_id % 3,
+            **_rest(scene_id),
+            "mass_kg": 0.5,
+            "friction": None,
+            "com": [0.01 * region, 0.0, 0.8],
+        }
         | {"contacts": [{"with_region": 2, **point}]}
     )
 

@@ -60,8 +60,8 @@ def read_label(row: Mapping[str, Any]) -> ObjectLabel:
     return ObjectLabel(**plain, T_cam_obj=read_matrix(row["T_cam_obj"]), bbox_xywh=tuple(row["bbox_xywh"]))
 
 
-def body_columns(start: ObjectStart, rest: Settled) -> Row:
-    """One object of a scene: an item of `scenes.bodies`."""
+def body_columns(start: ObjectStart, rest: Settled, friction: float | None) -> Row:
+    """One object of a scene: an item of `scenes.bodies`. friction: its coefficient, None where all have the same."""
     return {
         "region_id": start.region_id,
         "category": start.asset.category,
@@ -72,6 +72,7 @@ def body_columns(start: ObjectStart, rest: Settled) -> Row:
         "redraws": start.redraws,
         **{name: _known(getattr(rest, name)) for name in (*LARGEST, *SMALLEST)},
         "mass_kg": start.asset.mass.mass_kg,
+        "friction": friction,
         "com": (rest.T_world_obj[:3, :3] @ start.asset.mass.com + rest.T_world_obj[:3, 3]).tolist(),
         "contacts": [contact_columns(contact) for contact in rest.contacts],
     }

@@ -44,7 +44,7 @@ FRAMES = {
     "source": "the frame of the file that the shape came from",
 }
 
-Of = Literal["both", "scenes", "rest", "captures", "targets", "more", "look"]
+Of = Literal["both", "scenes", "rest", "captures", "targets", "more", "look", "friction"]
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,8 @@ class Column:
     """Whether the value may be missing where the column applies."""
     of: Of = "both"
     """The kind of dataset that has it, null in others: `rest`, of scenes on a table; `more`, of jobs with `cameras.more`;
-    `look`, of jobs with that. A table without any value of a column has the digest of one without the column."""
+    `look`, of jobs with that; `friction`, of jobs with `physics.friction` by category. A table without any value of a column, or
+    of a field of one kind inside one, has the digest of one without it."""
 
     @property
     def nullable(self) -> bool:
@@ -147,6 +148,7 @@ bodies[].recheck_move_mm | double? | mm | - | {move}
 bodies[].recheck_turn_deg | double? | deg | - | {turn}
 bodies[].equilibrium_residual | double? | 1 | - | {balance}
 bodies[].mass_kg | double | kg | - | Mass, from volume (or surface, where open) and density.
+bodies[].friction | double, friction | 1 | - | Coefficient of its surface; a contact's is the product of two, at most 10.
 bodies[].com | double[3] | m | world | Centre of mass at rest.
 bodies[].contacts | list of struct | - | - | Contacts that carry it; their forces balance the weight.
 bodies[].contacts[].with_region | int64 | id | - | The region that it touches there.
@@ -389,6 +391,11 @@ OF_TARGETS = {
     table: frozenset(column.path for column in columns if column.of == "targets") for table, columns in COLUMNS.items()
 }
 """Columns of image targets and of samples of shapes, null in jobs without them."""
+
+OF_SOME = {
+    table: frozenset(column.path for column in columns if column.of != "both") for table, columns in COLUMNS.items()
+}
+"""Columns that datasets of one kind alone have."""
 
 SHAPE_FILE_COLUMNS = (pa.field("file_bytes", pa.int64()), pa.field("file_sha256", pa.string()))
 """More columns of `assets` in a range's own file: the size and the SHA-256 of the asset's GLB, null where none is

@@ -109,6 +109,11 @@ def _of_objects(name: str) -> str:
 CategoryName = Annotated[str, Field(max_length=1000), AfterValidator(_of_objects)]
 """A category of objects: any name that can be a folder's."""
 
+SurfaceName = Annotated[
+    str, Field(max_length=1000), AfterValidator(lambda name: name if name == TABLE else _of_objects(name))
+]
+"""What objects may touch: a category of objects, or the table, of whatever kind."""
+
 
 def is_usable(name: str) -> bool:
     """Whether a category may have this name."""
@@ -138,14 +143,14 @@ def _sources(tree: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return [source for source in sources if isinstance(source, dict)]
 
 
-def describe_unknown(names: Iterable[str], offered: Sequence[str]) -> str:
-    """What is wrong with names that no source offers, with the nearest one that some source does; empty where all are known."""
+def describe_unknown(names: Iterable[str], offered: Sequence[str], key: str = "categories") -> str:
+    """What is wrong with names, of a key, that no source offers, with the nearest that one does; empty where all are known."""
     some = tuple(itertools.islice(offered, MOST_TOLD))
     known = dict.fromkeys((*offered, *CATEGORIES))
     for name in names:
         if name not in known:
             return (
-                f"categories.{name}: no source offers it; {did_you_mean(name, known)}offered: {', '.join(some)}. A library "
+                f"{key}.{name}: no source offers it; {did_you_mean(name, known)}offered: {', '.join(some)}. A library "
                 "offers what its table names"
             )
     return ""
@@ -280,6 +285,11 @@ USUAL_DENSITY = 600.0
 """kg/m^3: of wood, or of things with hollows."""
 
 
+def value_of(given: float | Mapping[str, float], category: str, usual: float) -> float:
+    """What a key that has a number, or a map of numbers by category, says of this one; `usual` where the map lacks it."""
+    return given.get(category, usual) if isinstance(given, Mapping) else given
+
+
 Density = Annotated[
     Annotated[Positive, Tag("[number]")] | Annotated[dict[CategoryName, Positive], Field(min_length=1), Tag("[map]")],
     among_kinds("[number]", "[map]"),
@@ -302,8 +312,7 @@ class Assets(Frozen):
 
     def density_of(self, category: str) -> float:
         """kg/m^3 of a watertight solid of this category."""
-        given = self.density_kg_m3
-        return given.get(category, USUAL_DENSITY) if isinstance(given, dict) else given
+        return value_of(self.density_kg_m3, category, USUAL_DENSITY)
 
     @field_validator("objects")
     @classmethod

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, Field, field_validator, model_validator
 
 from schemas.base import Folder, Frozen, NonNegativeInt, Positive, PositiveInt, Seed, Share, Weight, with_defaults
-from schemas.job.assets import CATEGORIES, Assets, CategoryName, describe_unknown, offered_by, with_categories
+from schemas.job.assets import CATEGORIES, TABLE, Assets, CategoryName, describe_unknown, offered_by, with_categories
 from schemas.job.cameras import Cameras
 from schemas.job.captures import Captures, with_capture_keys
 from schemas.job.look import OF_COLOUR, Look
@@ -253,8 +253,15 @@ class Job(Frozen):
     def _offers_categories(self) -> "Job":
         sources = [source.model_dump() for source in self.assets.objects]
         built_in = all(source["source"] == "procedural" for source in sources)  # else known where a library is opened
-        if built_in and (unknown := describe_unknown(self.categories, offered_by(sources))):
-            raise ValueError(unknown)
+        maps = {
+            "categories": (self.categories, ()),
+            "assets.density_kg_m3": (self.assets.density_kg_m3, ()),
+            "physics.friction": (self.physics.friction, (TABLE,)),
+        }
+        for key, (given, more) in maps.items() if built_in else ():
+            names = given if isinstance(given, Mapping) else ()
+            if unknown := describe_unknown(names, (*offered_by(sources), *more), key):
+                raise ValueError(unknown)
         return self
 
     @model_validator(mode="after")

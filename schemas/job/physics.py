@@ -2,9 +2,21 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, PlainSerializer, model_validator
+from pydantic import BeforeValidator, Field, PlainSerializer, Tag, model_validator
 
-from schemas.base import Counts, Frozen, Interval, NonNegative, Positive, Range, Share, read_counts, write_counts
+from schemas.base import (
+    Counts,
+    Frozen,
+    Interval,
+    NonNegative,
+    Positive,
+    Range,
+    Share,
+    among_kinds,
+    read_counts,
+    write_counts,
+)
+from schemas.job.assets import SurfaceName, value_of
 
 MOST_OBJECTS = 50
 """Largest number of objects in a scene."""
@@ -59,6 +71,17 @@ class Rest(Frozen):
         return SPIN_PER_SPEED * self.speed_mm_s
 
 
+USUAL_FRICTION = 0.7
+
+Coefficient = Annotated[float, Field(ge=0, le=5)]
+
+Friction = Annotated[
+    Annotated[Coefficient, Tag("[number]")]
+    | Annotated[dict[SurfaceName, Coefficient], Field(min_length=1), Tag("[map]")],
+    among_kinds("[number]", "[map]"),
+]
+
+
 class Physics(Frozen):
     """PyBullet's settings."""
 
@@ -73,10 +96,11 @@ class Physics(Frozen):
     """Simulated time after which an object that still moves is a failure."""
     rest: Rest = Rest()
     """When an object counts as resting."""
-    friction: Annotated[float, Field(ge=0, le=5)] = 0.7
-    """Of each body; a contact's is the product of the two."""
+    friction: Friction = USUAL_FRICTION
+    """Of each body; a contact's is the product of the two, at most 10. Or by category, `{mug: 0.3, table: 1.2}`, where
+    others have the default."""
     rolling_friction: Annotated[float, Field(ge=0, le=0.01)] = 0.0005
-    """Of each body, metres: Bullet's torque is twice this, times `friction`, times the contact force."""
+    """Of each body, metres: Bullet's torque is this, times the sum of the two bodies' `friction`, times the contact force."""
     spinning_friction: NonNegative = 0.0005
     """Of each body, metres: the same torque about the contact's normal."""
     restitution: Share = 0.0
@@ -88,6 +112,15 @@ class Physics(Frozen):
     """Largest depth of a hollow that convex parts fill, for a mesh scaled to size 2."""
     exact_rest: bool = True
     """Whether objects are brought to exact rest, and refused beyond the gate of docs/rest.md."""
+
+    def friction_of(self, category: str) -> float:
+        """The coefficient of a body of this category, or of the `table`."""
+        return value_of(self.friction, category, USUAL_FRICTION)
+
+    @property
+    def varies(self) -> bool:
+        """Whether friction is by category."""
+        return isinstance(self.friction, dict)
 
     @model_validator(mode="after")
     def _rests_in_time(self) -> "Physics":

@@ -113,8 +113,9 @@ def _one_of(given: object, allowed: str) -> str:
 
 
 def _written(place: Sequence[str | int]) -> list[str | int]:
-    """The parts of a place that the job file has: neither the kind that follows a source's position, nor that of a value."""
-    kinds = [(before, part) for before, part in zip((None, *place), place, strict=False) if part not in VALUE_KINDS]
+    """The parts of a place that the job file has: neither the kind of a source or a value, nor pydantic's mark of a map's key."""
+    marks = (*VALUE_KINDS, "[key]")
+    kinds = [(before, part) for before, part in zip((None, *place), place, strict=False) if part not in marks]
     return [part for before, part in kinds if not (isinstance(before, int) and part in SOURCE_KINDS)]
 
 

@@ -5,6 +5,7 @@ scene at rest is released again with every effect of physics on, and must stay; 
 is chaotic, so that single ends differ; what must agree is how far things go on average.
 """
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,13 +22,14 @@ from schemas.job.job import Job
 from schemas.scene.scene import EffectPlan, ObjectStart, Placed, PosedScene, SceneOutput
 from schemas.scene.shape import Shape
 from schemas.scene.view import MODALITIES, Camera, View
-from services.job.record import read_success, require_job
+from services.job.record import JobRecord, read_success, require_job
 from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, committed_reader, file_reader, find_scene
+from services.read.independent.cameras import read_stands
 from services.read.independent.derive import Kind, StoredPair
 from services.read.independent.poses import check_forces, check_merged, check_pair, list_underived
 from services.read.replay import compare_files, compare_rows, is_same_stack, open_context
 from services.read.scene_geometry import Sources
-from workers.assets.poses import PoseFile
+from workers.assets.catalogue import Catalogue
 from workers.assets.scene_tables import read_scene
 from workers.geometry.camera import NEAR_M, project
 from workers.geometry.frames import invert, motion_between, transform
@@ -206,19 +208,25 @@ def stored_kinds(job: Job) -> dict[str, list[Kind]]:
     return kinds
 
 
+def _open_tables(record: JobRecord) -> Catalogue | None:
+    """The catalogue of a job that names tables, where they are what they were when it was run."""
+    if record.job.scenes_from is not None or any(entry.poses for entry in record.job.cameras.more):
+        with contextlib.suppress(VersoError, OSError):
+            return Sources(record).catalogue
+    return None
+
+
 def verify_independently(
     store: Store, count: int, progress: Callable[[IndependentVerdict], None]
 ) -> IndependentVerdict:
     """Derive the labels of `count` scenes a second time. Raises OutputError where the folder is no dataset."""
     record = require_job(store)
     job = record.job.model_dump(mode="json")
-    verdict, kinds = IndependentVerdict(underived=list_underived(job)), stored_kinds(record.job)
-    table: PoseFile | None = None
-    if record.job.scenes_from is not None:
-        try:
-            table = Sources(record).catalogue.scenes
-        except (VersoError, OSError):
-            verdict.underived.append("poses are not compared with scenes_from: it is not here, or not what it was")
+    catalogue = _open_tables(record)
+    tables = {name: file.path for name, file in catalogue.poses.items()} if catalogue else {}
+    verdict, kinds = IndependentVerdict(underived=list_underived(job, tables)), stored_kinds(record.job)
+    if record.job.scenes_from is not None and catalogue is None:
+        verdict.underived.append("poses are not compared with scenes_from: it is not here, or not what it was")
     views: list[Row] = []
     objects: list[Row] = []
     for scene_id in choose_scenes(store, count, record.job.seed):
@@ -228,9 +236,9 @@ def verify_independently(
         assert scene is not None
         verdict.faults += check_forces(job, scene)
 
-        given = None
-        if table is not None:
-            rows = read_scene(table, scene_id)
+        stands, given = {name: read_stands(path, scene_id) for name, path in tables.items()}, None
+        if catalogue and catalogue.scenes is not None:
+            rows = read_scene(catalogue.scenes, scene_id)
             objects_there = [(each.instance_id, None if each.of_source else each.T_world_obj) for each in rows.objects]
             given = objects_there, [T for T, _ in rows.cameras]
 
@@ -238,7 +246,7 @@ def verify_independently(
             return store.read(path) if is_shape(path) else images(path)
 
         for pair_views, pair_objects in stored.pairs(scene_id):
-            pair = StoredPair(job, scene, pair_views, pair_objects, read, kinds, given=given)
+            pair = StoredPair(job, scene, pair_views, pair_objects, read, kinds, given=given, stands=stands)
             try:
                 verdict.faults += check_pair(pair)
             except CorruptError as error:

@@ -6,7 +6,7 @@ from schemas.job.physics import Physics
 from schemas.scene.scene import Settled
 from tests.hard_cases.measures import Made
 from tests.judge.judge import Verdict, judge
-from tests.judge.scenes import things_at_rest
+from tests.judge.scenes import frictions_of, things_at_rest
 
 GAP_MM = 0.01
 """Of overlap and hover, of whatever rests, on whatever it rests."""
@@ -16,8 +16,8 @@ UNBALANCED = 0.01
 
 
 def verdicts(made: Made, rest: Sequence[Settled], physics: Physics) -> tuple[Verdict, ...]:
-    """The judge's on each object. A contact's friction is the product of both bodies'."""
-    return judge(things_at_rest(made.starts, rest), made.table.mesh, physics.friction**2)
+    """The judge's on each object."""
+    return judge(things_at_rest(made.starts, rest), made.table.mesh, frictions_of(made.starts, physics))
 
 
 def what_is_wrong(found: Sequence[Verdict]) -> str:

@@ -20,7 +20,7 @@ from tests.hard_cases.measures import below, both, flat, heights, moved, tilts
 from tests.hard_cases.measures import leaning as at_angle
 from tests.kit.shapes import asset_of, box
 
-MU = Job(name="t").physics.friction ** 2
+MU = Job(name="t").physics.friction_of("table") ** 2
 
 LADDER_M = (0.18, 0.006)
 """Length and thickness: it reaches less high than the walls of the tray."""

@@ -44,8 +44,11 @@ class Verdict:
     unbalanced: float
 
 
-def judge(things: Sequence[Thing], ground: Mesh, friction: float) -> tuple[Verdict, ...]:
-    """A verdict on each thing; `friction` is the coefficient of each contact. Gravity is along -z."""
+def judge(things: Sequence[Thing], ground: Mesh, friction: float | Sequence[float]) -> tuple[Verdict, ...]:
+    """A verdict on each thing. Gravity is along -z.
+
+    friction: the coefficient of each contact; or of each thing, and last of the ground: a contact has the product of two.
+    """
     surfaces = [surface(each.mesh) for each in things]
     everything = [*surfaces, surface(ground)]
     overlaps, hovers = np.zeros(len(everything)), np.full(len(everything), np.inf)
@@ -56,11 +59,12 @@ def judge(things: Sequence[Thing], ground: Mesh, friction: float) -> tuple[Verdi
         if apart <= BAND_M:
             deep_m = overlap_m(a, b)
             overlaps[[i, j]] = np.maximum(overlaps[[i, j]], deep_m)
-            touches.append(Touch(i, j if j < len(things) else GROUND, find_contacts(a, b, BAND_M, deep_m)))
+            mu = friction if isinstance(friction, float) else friction[i] * friction[j]
+            touches.append(Touch(i, j if j < len(things) else GROUND, find_contacts(a, b, BAND_M, deep_m), mu))
         if apart < max(hovers[i], hovers[j]):
             hovers[[i, j]] = np.minimum(hovers[[i, j]], distance_m(a, b))
     bodies = [Body(each.mass_kg, each.com, _size_m(of)) for each, of in zip(things, surfaces, strict=True)]
-    shares = unbalanced_shares(bodies, touches, friction)
+    shares = unbalanced_shares(bodies, touches)
     figures = zip(overlaps[:-1] * 1e3, hovers[:-1] * 1e3, shares, strict=True)
     return tuple(Verdict(*map(float, three)) for three in figures)
 

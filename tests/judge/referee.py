@@ -105,9 +105,8 @@ def _describe(
             )
         )
     # Bullet multiplies the bodies' coefficients, and doubles the product of rolling friction and friction.
-    both = [physics.friction**2] + [
-        2.0 * physics.friction * x for x in (physics.spinning_friction, physics.rolling_friction)
-    ]
+    each = physics.friction_of("table")
+    both = [each**2, 2.0 * each * physics.spinning_friction, 2.0 * each * physics.rolling_friction]
     slide, spin, roll = (_words([x]) for x in both)
     given = {"damping": damping, "meshes": "".join(meshes), "bodies": "".join(bodies)}
     return WORLD.format(slide=slide, spin=spin, roll=roll, **given)

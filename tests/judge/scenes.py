@@ -21,7 +21,7 @@ from workers.physics.fall import FINEST
 from workers.physics.pour import NOTHING_MORE, Pouring
 from workers.physics.settle import recheck_scene, settle_scene
 
-PARTS = ("release", "rest")
+PARTS = ("release", "hold")
 """The parts of `workers.physics.settle` whose time is taken: what moves the objects, and what brings them to rest."""
 
 CRASHED = "crashed"
@@ -92,7 +92,7 @@ def try_scene(
         return Outcome(scene_id, len(plan.objects), seconds, parts_s, refused, detail)
     drawn, plan = plan, dataclasses.replace(plan, objects=rest.starts)
     began = time.process_time()
-    verdicts = judge(things_at_rest(plan.objects, rest.settled), plan.table.mesh, physics.friction**2)
+    verdicts = judge(things_at_rest(plan.objects, rest.settled), plan.table.mesh, frictions_of(plan.objects, physics))
     judge_s = time.process_time() - began
     moved: tuple[float | None, float | None] = (None, None)
     if asked.recheck:
@@ -126,6 +126,11 @@ def things_at_rest(starts: Sequence[ObjectStart], settled: Sequence[Settled]) ->
         mesh = Mesh(transform(T, shape.vertices), shape.faces)
         things.append(Thing(mesh, mass.mass_kg, transform(T, mass.com[None, :])[0]))
     return things
+
+
+def frictions_of(starts: Sequence[ObjectStart], physics: Physics) -> list[float]:
+    """Of the objects, and last of the table."""
+    return [physics.friction_of(name) for name in (*(start.asset.category for start in starts), "table")]
 
 
 @contextmanager

@@ -36,14 +36,15 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """Contacts between two bodies, with normals towards `upper`."""
+    """Contacts between two bodies, with normals towards `upper` and a coefficient of friction."""
 
     upper: int
     lower: int
     at: Contacts
+    friction: float
 
 
-def unbalanced_shares(bodies: Sequence[Body], touches: Sequence[Touch], friction: float) -> Array:
+def unbalanced_shares(bodies: Sequence[Body], touches: Sequence[Touch]) -> Array:
     """[N]: what forces within the cones must leave of each weight.
 
     The larger of the force, in weights, and of the moment about the centre of mass, in weights times size. The largest of
@@ -52,7 +53,7 @@ def unbalanced_shares(bodies: Sequence[Body], touches: Sequence[Touch], friction
     shares = np.zeros(len(bodies))
     for members in _groups(len(bodies), touches):
         own = [touch for touch in touches if touch.upper in members]
-        shares[members] = _solve([bodies[k] for k in members], own, friction, {k: n for n, k in enumerate(members)})
+        shares[members] = _solve([bodies[k] for k in members], own, {k: n for n, k in enumerate(members)})
     return shares
 
 
@@ -64,8 +65,8 @@ def _groups(count: int, touches: Sequence[Touch]) -> list[list[int]]:
     return [list(np.flatnonzero(label == one)) for one in np.unique(label)]
 
 
-def _solve(bodies: Sequence[Body], touches: Sequence[Touch], friction: float, number: dict[int, int]) -> Array:
-    blocks = [_columns(bodies, touch, friction, number) for touch in touches if len(touch.at.points)]
+def _solve(bodies: Sequence[Body], touches: Sequence[Touch], number: dict[int, int]) -> Array:
+    blocks = [_columns(bodies, touch, number) for touch in touches if len(touch.at.points)]
     weights = np.tile([0.0, 0.0, -1.0, 0.0, 0.0, 0.0], len(bodies))
     if not blocks:
         return np.ones(len(bodies))
@@ -111,7 +112,7 @@ def _program(matrix: Array, weights: Array, directions: Sequence[Array]) -> tupl
     return best.x[:edges], best.x[edges:] if all_of.status == 0 else np.full(count, worst.x[edges])
 
 
-def _columns(bodies: Sequence[Body], touch: Touch, friction: float, number: dict[int, int]) -> Array:
+def _columns(bodies: Sequence[Body], touch: Touch, number: dict[int, int]) -> Array:
     """[6 n, N EDGES]: force in weights and moment in weights times size, of a force along each edge of each pyramid.
 
     A force of 1 is the weight of the lighter of the two.
@@ -119,7 +120,7 @@ def _columns(bodies: Sequence[Body], touch: Touch, friction: float, number: dict
     across = _tangents(touch.at.normals)
     angle = 2.0 * np.pi * np.arange(EDGES) / EDGES
     turn = np.stack([np.cos(angle), np.sin(angle)])
-    forces = touch.at.normals[:, None] + friction * np.einsum("ke,nkx->nex", turn, across)
+    forces = touch.at.normals[:, None] + touch.friction * np.einsum("ke,nkx->nex", turn, across)
     two = [(k, sign) for k, sign in ((touch.upper, 1.0), (touch.lower, -1.0)) if k != GROUND]
     unit = min(bodies[number[k]].mass_kg for k, _ in two)
     block = np.zeros((6 * len(bodies), len(forces) * EDGES))

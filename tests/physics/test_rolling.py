@@ -6,7 +6,7 @@ from tests.physics.room import MARGIN_M, PHYSICS, RATES_HZ, G, advance, at, ball
 from workers.physics.bullet import open_world
 
 RADIUS_M = 0.05
-ARM_M = 2 * PHYSICS.rolling_friction * PHYSICS.friction
+ARM_M = 2 * PHYSICS.rolling_friction * PHYSICS.friction_of("table")
 """Bullet's lever arm, metres: over both bodies, rolling friction times the other's friction."""
 
 
@@ -38,7 +38,7 @@ def test_a_ball_rolls_and_spins_on_another_body_against_the_torque_that_it_has_o
         advance(world, 2 * PHYSICS.step_hz)
         v, w = world.velocity(1)
     rolls = v[0] - (1.0 - 2.0 * ARM_M * G / (RADIUS_M * 1.4))
-    spins = w[2] - (spin - 2.0 * 2 * PHYSICS.spinning_friction * PHYSICS.friction * G / (0.4 * RADIUS_M**2))
+    spins = w[2] - (spin - 2.0 * 2 * PHYSICS.spinning_friction * PHYSICS.friction_of("table") * G / (0.4 * RADIUS_M**2))
     record_figure("rolling on a body: error of the speed after 2 s, m/s", "passed", rolls, 1e-8)
     record_figure("spinning on a body: error of the spin after 2 s, rad/s", "passed", spins, 1e-6)
     assert abs(rolls) < 1e-8 and abs(spins) < 1e-6

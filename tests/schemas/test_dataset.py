@@ -71,7 +71,7 @@ CONTACT = {"with_region": 2, "point": [0.0, 0.1, 0.7], "normal": [0.0, 0.0, 1.0]
 FIGURES = {"penetration_mm": 0.1, "hover_gap_mm": 0.2, "support_margin_mm": 9.0, "residual_speed_mm_s": 0.3}
 REST = {"recheck_move_mm": None, "recheck_turn_deg": None, "equilibrium_residual": 0.0, "redraws": 2, **FIGURES}
 NAMES = {"region_id": 3, "category": "mug", "instance_id": "m1", "source": "procedural", "object_scale": 1.0}
-MASS = {"mass_kg": 0.4, "com": [0.0, 0.1, 0.8], "contacts": [CONTACT]}
+MASS = {"mass_kg": 0.4, "friction": None, "com": [0.0, 0.1, 0.8], "contacts": [CONTACT]}
 BODY = {"T_world_obj": T.ravel().tolist(), **NAMES, **REST, **MASS}
 
 
@@ -95,7 +95,7 @@ def test_a_camera_a_label_and_a_contact_come_back_from_their_rows():
 def test_a_scene_has_its_first_bodys_names_and_its_worst_bodys_figures():
     names = {field.name for field in SCHEMAS["scenes"].field("bodies").type.value_type}
     assert set(BODY) == names
-    assert columns_of_bodies([BODY]).keys() == names - {"region_id", "mass_kg", "com", "contacts"}
+    assert columns_of_bodies([BODY]).keys() == names - {"region_id", "mass_kg", "friction", "com", "contacts"}
     for name, first, second, expected in (
         ("penetration_mm", 0.1, 0.5, 0.5),
         ("support_margin_mm", 9.0, 4.0, 4.0),

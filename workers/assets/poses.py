@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
@@ -39,9 +40,6 @@ BOUNDS: Mapping[str, tuple[float, float, bool]] = {
 MOST_M = 1e3
 """Farthest that a camera may be from its frame's origin, along an axis."""
 
-BLOCK = 1 << 16
-"""Rows that are judged at once."""
-
 TOLERANCE = 1e-4
 """How far a product R^T R may be from the identity: files of few digits are usual. What is used is the nearest rotation."""
 
@@ -56,7 +54,7 @@ class PoseFile:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """The rows of a table, in order.
+    """Rows of a table, in order.
 
     T [N, 4, 4] float64: camera to world, or to the first object with `of_object`; scene_ids [N] int64 or None; pinholes [N, 6]:
     the fields of `Intrinsics`, or None.
@@ -79,7 +77,7 @@ class Poses:
 
 
 def open_poses(job: Job, folder: Path) -> Mapping[str, PoseFile]:
-    """The tables that the job names, by camera, each read once and found sound.
+    """The tables that the job names, by camera, each read once, some thousand rows at a time, and found sound.
 
     Raises AssetSourceError naming the key, the row and the value that is wrong.
     """
@@ -92,8 +90,13 @@ def open_poses(job: Job, folder: Path) -> Mapping[str, PoseFile]:
             if path.exists() and not path.is_file():
                 raise ValueError("is no file")
             opened[entry.name] = PoseFile(path, digest_file(path))
-            poses = read_poses(opened[entry.name])
-            require_scenes(poses.scene_ids, len(poses.T), job, MOST_VIEWS, "add theirs")
+            rows, ids = 0, list[np.ndarray]()
+            for block in _blocks(path):
+                rows += len(block.T)
+                ids += [] if block.scene_ids is None else [block.scene_ids]
+            if not rows:
+                raise ValueError("has no rows")
+            require_scenes(np.concatenate(ids) if ids else None, rows, job, MOST_VIEWS, "add theirs")
     return opened
 
 
@@ -130,31 +133,63 @@ def require_scenes(ids: np.ndarray | None, rows: int, job: Job, most: int, remed
 
 
 @lru_cache(maxsize=8)
-def read_poses(file: PoseFile) -> Poses:
-    """The rows of a table. Raises ValueError where they are none, OSError where it cannot be read."""
-    table = open_table(file.path).read_all()
-    names = table.column_names
-    if not len(table):
+def read_poses(file: PoseFile, first: int) -> Poses:
+    """The rows of `TOGETHER` scenes from `first` on, of a table that was found sound; all where it has no scene_id."""
+    parts = [part for part in _blocks(file.path, range(first, first + TOGETHER)) if len(part.T)]
+    ids, pinholes = ([getattr(part, name) for part in parts] for name in ("scene_ids", "pinholes"))
+    return Poses(
+        np.concatenate([part.T for part in parts]),
+        parts[0].of_object,
+        None if ids[0] is None else np.concatenate(ids),
+        None if pinholes[0] is None else np.concatenate(pinholes),
+    )
+
+
+def poses_of(file: PoseFile, scene_id: int) -> tuple[bool, Iterator[tuple[Array, Intrinsics | None]]]:
+    """(whether poses are of the first object, the pose and the intrinsics of each view) of a scene."""
+    poses = read_poses(file, scene_id // TOGETHER * TOGETHER)
+    return poses.of_object, poses.of_scene(scene_id)
+
+
+def _blocks(path: Path, near: range | None = None) -> Iterator[Poses]:
+    """The rows of a table, some thousands at a time; those of scenes near. Raises ValueError, OSError, ArrowException."""
+    start, reader = 0, open_table(path, near=near)
+    if not (names := reader.schema.names):
         raise ValueError("has no rows")
     frames = [name for name in FRAMES if name in names]
     if len(frames) > 1:
         raise ValueError(f"has the columns {' and '.join(frames)}: give one of them")
-    if frames:
-        T = _matrices(table.column(frames[0]), frames[0])
-    elif set(names).issuperset(ELEMENTS):
-        T = np.stack([_numbers(table, name) for name in ELEMENTS], axis=1).reshape(-1, 4, 4)
-    else:
+    if not frames and not set(names).issuperset(ELEMENTS):
         raise ValueError(
             f"has no column {' or '.join(FRAMES)}, and not T00 to T33; its columns are {', '.join(names)[:200]}"
         )
     there = [name for name in PINHOLE if name in names]
     if there and len(there) < len(PINHOLE):
         raise ValueError(f"has the columns {', '.join(there)}: give all of {', '.join(PINHOLE)}, or none")
-    pinholes = np.stack([_numbers(table, name, *BOUNDS[name]) for name in PINHOLE], axis=1) if there else None
-    scene_ids = _numbers(table, "scene_id", 0, 2**53, True).astype(np.int64) if "scene_id" in names else None
-    for start in range(0, len(T), BLOCK):
-        T[start : start + BLOCK] = rigid(T[start : start + BLOCK], start)
-    return Poses(T, frames == ["T_obj_cam"], scene_ids, pinholes)
+    for batch in reader:
+        batch = batch if near is None else only_near(batch, near)
+        if frames:
+            T = _matrices(batch.column(frames[0]), frames[0], start)
+        else:
+            T = np.stack([_numbers(batch, name, start) for name in ELEMENTS], axis=1).reshape(-1, 4, 4)
+        ids = _numbers(batch, "scene_id", start, 0, 2**53, True).astype(np.int64) if "scene_id" in names else None
+        pinholes = (
+            np.stack([_numbers(batch, name, start, *BOUNDS[name]) for name in PINHOLE], axis=1) if there else None
+        )
+        yield Poses(rigid(T, start), frames == ["T_obj_cam"], ids, pinholes)
+        start += len(batch)
+
+
+TOGETHER = 64
+"""Scenes whose rows are read at once: as many as a shard has."""
+
+
+def only_near(batch: pa.RecordBatch, near: range) -> pa.RecordBatch:
+    """The rows of a batch with a `scene_id` near; all where it has none."""
+    if "scene_id" not in batch.schema.names:
+        return batch
+    id_ = batch.column("scene_id")
+    return batch.filter(pc.and_(pc.greater_equal(id_, near.start), pc.less(id_, near.stop)))
 
 
 MOST_JSON = 32 * 2**20
@@ -205,10 +240,15 @@ def _may_hold(group: Any, near: range) -> bool:
     return True
 
 
-def _numbers(table: pa.Table, name: str, least: float = -np.inf, most: float = np.inf, whole: bool = False) -> Array:
-    """A column [N] float64. Raises ValueError where a value is no finite number, out of bounds, or not whole and must be."""
+def _numbers(
+    rows: pa.RecordBatch, name: str, start: int, least: float = -np.inf, most: float = np.inf, whole: bool = False
+) -> Array:
+    """A column [N] float64; `start`: the first row's number.
+
+    Raises ValueError where a value is no finite number, out of bounds, or not whole and must be.
+    """
     try:
-        values = np.array(table.column(name).cast(pa.float64()).to_numpy())
+        values = np.array(rows.column(name).cast(pa.float64()).to_numpy(zero_copy_only=False))
     except pa.ArrowException as error:
         raise ValueError(f"column {name} holds something that is no number: {str(error).splitlines()[0]}") from error
     for wrong, what in (
@@ -217,20 +257,21 @@ def _numbers(table: pa.Table, name: str, least: float = -np.inf, most: float = n
         (values != np.rint(values) if whole else np.zeros(0, bool), "a whole number"),
     ):
         if wrong.any():
-            raise ValueError(f"row {np.argmax(wrong)}: {name} is {values[np.argmax(wrong)]:g}, and must be {what}")
+            raise ValueError(
+                f"row {start + np.argmax(wrong)}: {name} is {values[np.argmax(wrong)]:g}, and must be {what}"
+            )
     return values
 
 
-def _matrices(column: pa.ChunkedArray, name: str) -> Array:
+def _matrices(values: pa.Array, name: str, start: int) -> Array:
     """[N, 4, 4] of a column of lists of sixteen numbers, of four lists of four, or of such lists as text."""
-    values = column.combine_chunks()
     if pa.types.is_list(values.type) and pa.types.is_floating(values.type.value_type):
         lengths = values.value_lengths()
         if not values.null_count and (lengths.to_numpy() == 16).all():
             return np.array(values.flatten().cast(pa.float64()).to_numpy(zero_copy_only=False)).reshape(-1, 4, 4)
     T = np.empty((len(values), 4, 4))
     for number, row in enumerate(values):
-        T[number] = matrix_of(row.as_py(), f"row {number}: {name}")
+        T[number] = matrix_of(row.as_py(), f"row {start + number}: {name}")
     return T
 
 

@@ -33,10 +33,12 @@ from workers.assets.poses import (
     BOUNDS,
     ELEMENTS,
     PINHOLE,
+    TOGETHER,
     PoseFile,
     digest_file,
     matrix_of,
     naming,
+    only_near,
     open_table,
     require_scenes,
     rigid,
@@ -49,9 +51,6 @@ _COLUMNS = ("instance_id", "category", "T_world_obj", "settle", "table_id", "sha
 
 MOST_ROWS = 10_000
 """Of a scene."""
-
-TOGETHER = 64
-"""Scenes whose rows are read at once: as many as a shard has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,10 +214,7 @@ def _rows_near(file: PoseFile, table: str, columns: tuple[str, ...], first: int)
     for reader in _readers(file.path, table, ("scene_id", *columns), near):
         there = [name for name in ("scene_id", *columns) if name in reader.schema.names]
         for batch in reader:
-            if "scene_id" in there:
-                id_ = batch.column("scene_id")
-                batch = batch.filter(pc.and_(pc.greater_equal(id_, near.start), pc.less(id_, near.stop)))
-            rows += batch.select(there).to_pylist()
+            rows += only_near(batch, near).select(there).to_pylist()
     return rows
 
 

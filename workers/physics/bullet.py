@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.errors import SettleError
+from schemas.job.assets import TABLE
 from schemas.job.physics import Physics
 from schemas.scene.shape import Mesh
 from workers.geometry.frames import quaternion_from_rotation
@@ -102,6 +103,9 @@ with silence_stderr():
 
 GRAVITY_M_S2 = 9.81
 
+MOST_FRICTION = 10.0
+"""Bullet's bound on the coefficient of a contact."""
+
 SLAB_HALF_M = (2.0, 2.0, 0.25)
 """Half extents of the box for level ground, larger and thicker than any table. Bullet's plane is twice as fast but has one
 contact per step: a box that lands on an edge turns about the vertical by ten times as much."""
@@ -134,6 +138,11 @@ AWAY_M = 100.0
 GroundShape = float | Mesh | Array | list[Array] | tuple[Mesh, ...]
 """Level ground at a height, metres, without an end; a mesh, or several; or the vertices [N, 3] of a convex body, or of all parts
 of one."""
+
+
+def contact_friction(one: Array | float, other: Array | float) -> Array:
+    """The coefficient of contacts between bodies of these, as Bullet has it: the product, at most `MOST_FRICTION`."""
+    return np.minimum(np.multiply(one, other), MOST_FRICTION)
 
 
 def bullet_file() -> str:
@@ -366,7 +375,7 @@ def _set_surface(client: int, thing: int, physics: Physics, body: Body | None = 
     pybullet.changeDynamics(
         thing,
         -1,
-        lateralFriction=physics.friction,
+        lateralFriction=physics.friction_of(TABLE if body is None else body.category),
         rollingFriction=max(physics.rolling_friction, least),
         spinningFriction=physics.spinning_friction,
         restitution=0.0,

@@ -8,6 +8,7 @@ import numpy as np
 
 from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
+from schemas.job.assets import TABLE
 from schemas.job.physics import Physics
 from schemas.scene.scene import ObjectStart, Settled, SupportedBy
 from workers.geometry.frames import transform
@@ -82,8 +83,8 @@ def _what_moves(physics: Physics, start: ObjectStart, outcome: Outcome) -> str:
     )
     if physics.restitution > 0.0 and speed_m_s > spin_rad_s * reach_m:  # faster than it rolls
         advice = f"physics.max_settle_s, or lower physics.restitution, which is {physics.restitution:g}"
-    elif physics.friction == 0.0:
-        advice = "physics.friction, which is 0"
+    elif slippery := [name for name in (start.asset.category, TABLE) if physics.friction_of(name) == 0.0]:
+        advice = f"physics.friction, which is 0 of the {slippery[0]}"
     elif physics.spinning_friction == 0.0 and speed_m_s < spin_rad_s * SPINS_M:
         advice = "physics.spinning_friction, which is 0"
     return (

@@ -4,8 +4,9 @@ A step begins at rest: gravity, contacts that may not close beyond touching, dry
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 
 import daqp
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.spatial import cKDTree
 from schemas.base import Array, Pose
 from schemas.scene.shape import MassProperties
 from workers.geometry.frames import DOWN, pose, rotation_about, transform
-from workers.physics.bullet import GRAVITY_M_S2
+from workers.physics.bullet import GRAVITY_M_S2, contact_friction
 from workers.physics.contact_surface import Surface
 from workers.physics.contacts import DEEPEST_M, Contacts, find_contacts, find_near_features
 
@@ -83,10 +84,9 @@ class JammedError(Exception):
 
 def step(
     bodies: Sequence[Inertia],
+    frictions: Array,
     contacts: Contacts,
-    friction: float,
     fall: Array,
-    gravity_m_s2: float,
     spinning_m: float = 0.0,
     before: Motion | None = None,
 ) -> Motion:
@@ -96,32 +96,36 @@ def step(
     motion d at every contact: the convex relaxation of Coulomb's law by Anitescu (2006, "Optimization-based simulation of
     nonsmooth rigid multibody dynamics"). A least-distance problem, solved by DAQP (Arnstrom et al. 2022, "A dual active-set
     solver for embedded quadratic programming"). Its multipliers are the contact forces; where nothing moves they balance the
-    weights, which is static equilibrium. Where no motion satisfies all, overlap of up to `FLUSH_M` may stay. before: a step of
-    the same bodies shortly before, by which it is solved ten times sooner. Raises JammedError.
+    weights, which is static equilibrium. Where no motion satisfies all, overlap of up to `FLUSH_M` may stay. frictions
+    [bodies + 1]: coefficients of the bodies, and last of the ground. spinning_m: spinning friction of each, metres; the arm of a
+    contact's torque is Bullet's, this times the sum of both coefficients. before: a step of the same bodies shortly before, by
+    which it is solved ten times sooner. Raises JammedError.
     """
     # The inverse of the square root of each tensor of inertia
     roots = [(axes / np.sqrt(moments)) @ axes.T for moments, axes in (np.linalg.eigh(body.tensor) for body in bodies)]
     root_masses = np.sqrt([body.mass_kg for body in bodies])
-    edges, arms_m = _pyramid(contacts.normals, friction), np.zeros(CONE_EDGES)
+    upper, lower = frictions[contacts.upper], frictions[contacts.lower]
+    edges = _pyramid(contacts.normals, contact_friction(upper, lower))
+    arms_m = np.zeros((len(edges), CONE_EDGES))
     if spinning_m:
         edges = np.concatenate([edges, contacts.normals[:, None].repeat(2, axis=1)], axis=1)
-        arms_m = np.append(arms_m, [spinning_m, -spinning_m])
-    matrix = _rows(bodies, roots, contacts, edges, arms_m)
+        arms_m = np.concatenate([arms_m, np.outer(spinning_m * (upper + lower), [1.0, -1.0])], axis=1)
+    matrix, edge_count = _rows(bodies, roots, contacts, edges, arms_m), edges.shape[1]
     fall_m = float(np.linalg.norm(fall))
     free = np.zeros((len(bodies), 6))
     free[:, :3] = root_masses[:, None] * fall / fall_m
     # Lengths in units of `fall_m`, so that all numbers are near 1
-    needed = -np.repeat(contacts.gaps / fall_m, len(arms_m)) - matrix @ free.ravel()
-    likely = None if before is None or not len(matrix) else before.likely(contacts, len(arms_m))
+    needed = -np.repeat(contacts.gaps / fall_m, edge_count) - matrix @ free.ravel()
+    likely = None if before is None or not len(matrix) else before.likely(contacts, edge_count)
     try:
         away, multipliers = _least_distance(matrix, needed, likely)
     except JammedError:
         flush_m = np.where((contacts.gaps < 0.0) & (contacts.gaps >= -FLUSH_M), contacts.gaps, 0.0)
         if not flush_m.any():
             raise
-        away, multipliers = _least_distance(matrix, needed + np.repeat(flush_m / fall_m, len(arms_m)), likely)
+        away, multipliers = _least_distance(matrix, needed + np.repeat(flush_m / fall_m, edge_count), likely)
     multipliers = multipliers.reshape(edges.shape[:2])
-    forces = gravity_m_s2 * (np.maximum(0.0, -multipliers)[..., None] * edges).sum(axis=1)
+    forces = GRAVITY_M_S2 * (np.maximum(0.0, -multipliers)[..., None] * edges).sum(axis=1)
     moved = (free + away.reshape(free.shape)) * fall_m
     turns = np.stack([root @ each for root, each in zip(roots, moved[:, 3:], strict=True)])
     return Motion(moved[:, :3] / root_masses[:, None], turns, forces, contacts, multipliers)
@@ -167,7 +171,7 @@ def _solve(matrix: Array, least: Array, start: Array | None = None) -> tuple[Arr
 def _rows(bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts, edges: Array, arms_m: Array) -> Array:
     """[contacts CONE_EDGES, 6 bodies]: how motion opens contacts along each edge, in units of root of kinetic energy."""
     rows = np.zeros((*edges.shape[:2], len(bodies), 6))
-    twists = arms_m[:, None] * contacts.normals[:, None]
+    twists = arms_m[:, :, None] * contacts.normals[:, None]
     for number, (body, root) in enumerate(zip(bodies, roots, strict=True)):
         its = np.flatnonzero(contacts.of(number))
         sign = np.where(contacts.upper[its] == number, 1.0, -1.0)[:, None, None]
@@ -177,8 +181,8 @@ def _rows(bodies: Sequence[Inertia], roots: Sequence[Array], contacts: Contacts,
     return rows.reshape(-1, 6 * len(bodies))
 
 
-def _pyramid(normals: Array, friction: float) -> Array:
-    """[N, CONE_EDGES, 3]: edges of friction pyramids about unit normals, with a normal component of 1.
+def _pyramid(normals: Array, friction: Array) -> Array:
+    """[N, CONE_EDGES, 3]: edges of pyramids of these coefficients [N] about unit normals, with a normal component of 1.
 
     The first edge leans against gravity, so that a slope has all of its friction.
     """
@@ -189,7 +193,7 @@ def _pyramid(normals: Array, friction: float) -> Array:
     second = np.cross(normals, first)
     angle = 2.0 * np.pi * np.arange(CONE_EDGES) / CONE_EDGES
     side = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
-    return normals[:, None] + friction * side
+    return normals[:, None] + friction[:, None, None] * side
 
 
 LEVEL = 1e-3
@@ -261,14 +265,14 @@ def rest(
     things: Sequence[Thing],
     poses: Sequence[Pose],
     ground: Surface,
-    friction: float,
+    frictions: Array,
     most_sliding: float = math.inf,
     spinning_m: float = 0.0,
 ) -> Rested:
     """Bodies let go at rest from `poses` (`T_world_obj`), followed without speed until nothing moves any more.
 
     What overlaps is moved apart, what hovers falls, what is out of balance tips, also from an edge or a corner that it was
-    balanced on. friction: the coefficient of a contact. Not `still` after `MOST_STEPS` and more or so many in which something
+    balanced on. frictions, spinning_m: as of `step`. Not `still` after `MOST_STEPS` and more or so many in which something
     slides, or where overlapping bodies are jammed.
     """
     most = max(MOST_STEPS, STEPS_EACH * len(things))
@@ -285,12 +289,11 @@ def rest(
             near, known_m = find_near_features(surfaces, points, DEEPEST_M + REACH_M), REACH_M
         contacts = find_contacts(surfaces, points, near, REACH_M, DEEPEST_M)
         inertias = [thing.inertia(T) for T, thing in zip(at, things, strict=True)]
-        given = inertias, contacts, friction
+        move = partial(step, inertias, frictions, spinning_m=spinning_m if number >= most else 0.0)
         try:
-            spun_m = spinning_m if number >= most else 0.0
-            motion, jammed = _step_past_seams(*given, fall_m, spun_m, motion)
+            motion, jammed = _step_past_seams(partial(move, before=motion), contacts, fall_m)
             if _farthest(motion, reaches) <= STILL * fall_m and nudges < MOST_NUDGES and not jammed:
-                nudge, nudges = _nudge(*given, reaches, spun_m, motion), nudges + 1
+                nudge, nudges = _nudge(partial(move, before=motion), contacts, reaches), nudges + 1
                 if _farthest(nudge, reaches) > LEVEL * LEVEL * LONGEST_FALL_M:
                     motion, pushed = nudge, np.zeros(0)
         except JammedError:
@@ -308,27 +311,24 @@ def rest(
     return Rested(at, False, most)
 
 
-def _step_past_seams(
-    bodies: Sequence[Inertia],
-    contacts: Contacts,
-    friction: float,
-    fall_m: float,
-    spinning_m: float,
-    before: Motion | None,
-) -> tuple[Motion, bool]:
+Move = Callable[[Contacts, Array], Motion]
+"""`step` of bodies, by contacts and a fall."""
+
+
+def _step_past_seams(move: Move, contacts: Contacts, fall_m: float) -> tuple[Motion, bool]:
     """A step, and whether it left out contacts deeper than `SEAM_M`, which it does where none satisfies all. Raises JammedError.
 
     Edges on the two sides of a thin wall cross as if the wall were overlap: of bowls in one another for the instant in which
     their facets pass. Nothing may come to rest in such a step.
     """
     try:
-        return step(bodies, contacts, friction, fall_m * DOWN, GRAVITY_M_S2, spinning_m, before), False
+        return move(contacts, fall_m * DOWN), False
     except JammedError:
         shallow = contacts.gaps >= -SEAM_M
         if shallow.all():
             raise
         few = Contacts(*(getattr(contacts, name.name)[shallow] for name in fields(Contacts)))
-        return step(bodies, few, friction, fall_m * DOWN, GRAVITY_M_S2, spinning_m, before), True
+        return move(few, fall_m * DOWN), True
 
 
 def _farthest(motion: Motion, reaches: Array) -> float:
@@ -346,21 +346,11 @@ def _swings_wider(before: Array, now: Array) -> bool:
     return sizes[1] > sizes[0] and float(before @ now) < -0.5 * sizes[0] * sizes[1]
 
 
-def _nudge(
-    bodies: Sequence[Inertia],
-    contacts: Contacts,
-    friction: float,
-    reaches: Array,
-    spinning_m: float,
-    before: Motion,
-) -> Motion:
+def _nudge(move: Move, contacts: Contacts, reaches: Array) -> Motion:
     """The farthest motion of bodies in balance on a ground that leans by `LEVEL` to one of four sides."""
     x, y = LEVEL * math.cos(ASLANT_RAD), LEVEL * math.sin(ASLANT_RAD)
     sides = np.array([[x, y, 0.0], [-y, x, 0.0], [-x, -y, 0.0], [y, -x, 0.0]])
-    motions = [
-        step(bodies, contacts, friction, LONGEST_FALL_M * (DOWN + side), GRAVITY_M_S2, spinning_m, before)
-        for side in sides
-    ]
+    motions = [move(contacts, LONGEST_FALL_M * (DOWN + side)) for side in sides]
     return max(motions, key=lambda motion: _farthest(motion, reaches))
 
 

@@ -21,7 +21,7 @@ from workers.physics.bullet import GRAVITY_M_S2, SLOP_M, SLOP_SHARE, GroundShape
 from workers.physics.contact_surface import faces_within, skin_of
 from workers.physics.contacts import contacts_within
 from workers.physics.effects import is_convex
-from workers.physics.exact_rest import LEVEL, Rested, rest
+from workers.physics.exact_rest import LEVEL, Rested
 from workers.physics.fall import FINEST, Outcome, StepSizes, Watch, fall, strays
 from workers.physics.placement import TOUCHING_M, Form, Placement, farthest_m, forms_of, place, placed_mesh
 from workers.physics.pour import points_of
@@ -80,12 +80,11 @@ def hold(drop: Drop, placement: Placement, poses: Sequence[Pose]) -> Rested:
     if drop.in_waves:
         still = still.model_copy(update={"window_s": POURED_HOLD_S})
     held_m = max(held_m, min(UNEVEN_M, held_m * (unevenness(drop.starts) / UNEVEN) ** 0.25))
-    spinning_m = 2.0 * drop.physics.friction * drop.physics.spinning_friction  # Bullet's arm
     changes = {"rest": still, "max_settle_s": 0.15 + still.window_s}
     held = dataclasses.replace(drop, physics=drop.physics.model_copy(update=changes))
     for far_m in (2.0**number * FAR_M for number in range(MOST_HOLDS)):
         most = POURED_STEPS if drop.in_waves else math.inf
-        rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction, most, spinning_m)
+        rested = placement.rest(poses, most, drop.physics.spinning_friction)
         if not rested.still or len(poses) >= CROWD:
             return rested
         # No larger groups for what may move farther: the solver ends too early in them, and hides what slips
@@ -210,7 +209,7 @@ def release_again(
     calm = physics.rest.model_copy(update={"window_s": 2.0 * seconds})
     physics = physics.model_copy(update={"max_settle_s": seconds, "rest": calm})
     starts, poses = plan.objects, [each.T_world_obj for each in settled]
-    placement = place(starts, poses, forms_of(starts), plan.table, physics.friction**2)
+    placement = place(starts, poses, forms_of(starts), plan.table, physics)
     return let_go(Drop(starts, plan.table, physics, effects), placement, poses, rate=rate)[0]
 
 
@@ -235,7 +234,7 @@ def land(drop: Drop, flat: bool, forms: Sequence[Form]) -> tuple[Placement, tupl
     if fallen is None or fallen[1] > drop.physics.max_settle_s:
         return None
     poses, seconds = fallen
-    placement = place(drop.starts, poses, forms, drop.table, drop.physics.friction**2)
+    placement = place(drop.starts, poses, forms, drop.table, drop.physics)
     rested = hold(drop, placement, poses)
     stands = rested.still and farthest_m(drop.starts, poses, rested.poses) <= TOUCHING_M
     return (placement, rested.poses, seconds) if stands else None

@@ -1,6 +1,7 @@
 """Objects at poses on a table: distances and overlaps between true meshes, and how contacts hold them up. Pure."""
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -8,17 +9,18 @@ from functools import cached_property
 import manifold3d
 import numpy as np
 
-from schemas.base import Pose, frozen_array
+from schemas.base import Array, Pose, frozen_array
 from schemas.errors import SettleError
+from schemas.job.assets import TABLE
+from schemas.job.physics import Physics
 from schemas.scene.scene import ContactForce, ObjectStart, Table
 from schemas.scene.shape import REGION_TABLE, Mesh
 from workers.geometry.frames import DOWN, motion_between, transform
 from workers.geometry.hull import convex_hull, least_width_m
 from workers.geometry.mesh import bounds_of, hold_to_one_thread, mesh_of, solid_of, weld
-from workers.physics.bullet import GRAVITY_M_S2
 from workers.physics.contact_surface import Surface, crop, is_closed, surface_of
 from workers.physics.contacts import Contacts, contacts_within
-from workers.physics.exact_rest import FALL_M, Inertia, Motion, Thing, step
+from workers.physics.exact_rest import FALL_M, Inertia, Motion, Rested, Thing, rest, step
 from workers.physics.support import support_margin
 
 FARTHEST_M = 0.01
@@ -133,13 +135,14 @@ its gap is measured up to `FARTHEST_M`."""
 class Placement:
     """Objects and the table below them, with all that their rest is found and measured by.
 
-    things: the objects as bodies; forms: their meshes, and last the table's; friction: the coefficient of a contact.
+    things: the objects as bodies; forms: their meshes, and last the table's; frictions [objects + 1]: likewise, their
+    coefficients, of which a contact has `contact_friction`.
     """
 
     starts: tuple[ObjectStart, ...]
     things: tuple[Thing, ...]
     forms: tuple[Form, ...]
-    friction: float
+    frictions: Array
 
     @property
     def surfaces(self) -> tuple[Surface, ...]:
@@ -149,7 +152,12 @@ class Placement:
     def of(self, numbers: Sequence[int]) -> "Placement":
         """Some of the objects, by their numbers, with the same table."""
         starts, things = tuple(self.starts[k] for k in numbers), tuple(self.things[k] for k in numbers)
-        return Placement(starts, things, tuple(self.forms[k] for k in (*numbers, -1)), self.friction)
+        forms = tuple(self.forms[k] for k in (*numbers, -1))
+        return Placement(starts, things, forms, self.frictions[[*numbers, -1]])
+
+    def rest(self, poses: Sequence[Pose], most_sliding: float = math.inf, spinning_m: float = 0.0) -> Rested:
+        """`rest` of the objects from these `T_world_obj`."""
+        return rest(self.things, poses, self.forms[-1].surface, self.frictions, most_sliding, spinning_m)
 
 
 @dataclass(frozen=True)
@@ -187,13 +195,13 @@ def require_near_origin(start: ObjectStart) -> None:
         )
 
 
-def place_on_top(start: ObjectStart, T_world_obj: Pose, table: Table, friction: float) -> Placement:
+def place_on_top(start: ObjectStart, T_world_obj: Pose, table: Table, physics: Physics) -> Placement:
     """A single object over the table's flat top, with its underside alone, which is all that can touch there."""
     world, shape = placed_mesh(start, T_world_obj), start.asset.shape
     top = np.array([np.inf, np.inf, world.vertices[:, 2].min() + NEAR_M])
     under = Mesh(shape.vertices, crop(world, np.full(3, -np.inf), top).faces)
     form = Form(under, closed=shape.closed or is_closed(shape.mesh))
-    return place((start,), (T_world_obj,), [form], table, friction, FARTHEST_M)
+    return place((start,), (T_world_obj,), [form], table, physics, FARTHEST_M)
 
 
 def place(
@@ -201,16 +209,16 @@ def place(
     poses: Sequence[Pose],
     forms: Sequence[Form],
     table: Table,
-    friction: float,
+    physics: Physics,
     room_m: float = ROOM_M,
 ) -> Placement:
-    """The objects, as these forms, with the part of the table within `room_m` of these poses."""
+    """The objects, as these forms, with the part of the table within `room_m` of these poses, and the settings' friction."""
     points = np.concatenate([transform(T, start.hull.vertices) for start, T in zip(starts, poses, strict=True)])
     near = crop(table.mesh, *np.add(bounds_of(points), [[-room_m], [room_m]]))
     things = tuple(Thing(form.surface, start.asset.mass) for form, start in zip(forms, starts, strict=True))
-    return Placement(
-        tuple(starts), things, (*forms, Form(near, table.mesh, outward=table.asset.shape.closed)), friction
-    )
+    frictions = np.array([physics.friction_of(name) for name in (*(start.asset.category for start in starts), TABLE)])
+    below = Form(near, table.mesh, outward=table.asset.shape.closed)
+    return Placement(tuple(starts), things, (*forms, below), frictions)
 
 
 def farthest_m(starts: Sequence[ObjectStart], poses: Sequence[Pose], others: Sequence[Pose]) -> float:
@@ -230,7 +238,7 @@ def measure_supports(placement: Placement, poses: Sequence[Pose]) -> tuple[Suppo
     touching = contacts_within(placement.surfaces, (*poses, np.eye(4)), TOUCHING_M)
     contacts = replace(touching, gaps=np.zeros_like(touching.gaps))
     inertias = [thing.inertia(T) for T, thing in zip(poses, placement.things, strict=True)]
-    motion = step(inertias, contacts, placement.friction, FALL_M * DOWN, GRAVITY_M_S2)
+    motion = step(inertias, placement.frictions, contacts, FALL_M * DOWN)
     return tuple(
         _describe(placement, number, inertia, contacts, motion, gap)
         for number, (inertia, gap) in enumerate(zip(inertias, gaps_m, strict=False))

@@ -12,11 +12,12 @@ from functools import cached_property
 import numpy as np
 
 from schemas.base import Array
+from schemas.job.assets import TABLE
 from schemas.job.physics import Physics
 from schemas.scene.scene import EffectPlan, ObjectStart, Table
 from workers.geometry.frames import invert, transform
 from workers.geometry.hull import least_width_m
-from workers.physics.bullet import SLOP_SHARE, GroundShape
+from workers.physics.bullet import SLOP_SHARE, GroundShape, contact_friction
 from workers.physics.convex_parts import parts_of
 from workers.physics.fall import (
     LIFT_M,
@@ -222,7 +223,7 @@ def _release(drop: Drop, flat: bool, pace: Pace, looked: int) -> Outcome:
     ground: GroundShape = table.mesh
     standing = None
     if flat and drop.single and physics.exact_rest:
-        standing = stays_standing(starts[0], bodies[0], table.top.height_m, physics.friction**2)
+        standing = stays_standing(starts[0], bodies[0], table.top.height_m, physics)
     if flat and not drop.many:
         hover_m = bodies[0].margin_m * (1.0 - SLOP_SHARE)
         ground, stops = table.top.height_m - hover_m, {"edge": leaves_outline(table.top.outline, reach_m)}
@@ -314,12 +315,13 @@ def falls_below(height_m: float) -> StopCondition:
     return lambda _, at: at[0][2] < height_m
 
 
-def stays_standing(start: ObjectStart, body: Body, top_m: float, friction: float) -> StandingCondition:
-    """The condition of an object over a flat top at the height `top_m`, with this coefficient of friction.
+def stays_standing(start: ObjectStart, body: Body, top_m: float, physics: Physics) -> StandingCondition:
+    """The condition of an object over a flat top at the height `top_m`.
 
     It has less energy than it takes to tip over the nearest edge of a steady face, and than friction takes up in `SLIDE_M`:
     m g h <= friction m g s. Energy may rise in the simulation, but not by more than `LIFT_M`.
     """
+    friction = float(contact_friction(physics.friction_of(body.category), physics.friction_of(TABLE)))
     radii2 = [float(moment) / body.mass_kg for moment in body.moments]
     T_body_obj = invert(body.T_obj_body)
 

@@ -41,7 +41,7 @@ class Body:
 
     moments [3] kg m^2; parts: the vertices [N, 3], metres, of convex parts, each with a margin of `margin_m` about it. One
     part may be a single point, which makes a ball of the margin. reach_m: from the centre of mass to the farthest vertex of
-    the object.
+    the object. category: of the object, by which its friction is known.
     """
 
     mass_kg: float
@@ -50,6 +50,7 @@ class Body:
     margin_m: float = MARGIN_M
     T_obj_body: Pose = field(default_factory=lambda: np.eye(4))
     reach_m: float = 0.0
+    category: str = ""
 
 
 def choose_collision_shape(start: ObjectStart, physics: Physics) -> ObjectStart:
@@ -122,7 +123,7 @@ def make_body(start: ObjectStart, parts: tuple[Array, ...] = (), coarse: bool = 
     if coarse and parts:
         vertices = tuple(map(_outermost, vertices))
     margin_m = min(MARGIN_M, MARGIN_SHARE * reach_m)
-    return Body(start.asset.mass.mass_kg, moments, vertices, margin_m, T_obj_body, reach_m)
+    return Body(start.asset.mass.mass_kg, moments, vertices, margin_m, T_obj_body, reach_m, start.asset.category)
 
 
 def body_frame(mass: MassProperties) -> tuple[Pose, Array]:

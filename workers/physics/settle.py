@@ -20,7 +20,6 @@ from workers.geometry.frames import translation
 from workers.geometry.mesh import join_meshes
 from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for, called_for_with, rooms_m
 from workers.physics.ending import Ending, UnsupportedError, describe, describe_kept, require_calm
-from workers.physics.exact_rest import rest
 from workers.physics.fall import Outcome
 from workers.physics.hold import RELEASE_RATE, hold, land, moved_by, release_again
 from workers.physics.placement import (
@@ -254,13 +253,13 @@ def _rest_as_placed(drop: Drop, forms: Sequence[Form], poses: tuple[Pose, ...]) 
     placement = _place(drop, poses, forms)
     if max(find_gaps_m(placement.forms, [*poses, np.eye(4)])[:-1]) > PLACED_M:
         return None
-    rested = rest(placement.things, poses, placement.forms[-1].surface, placement.friction)
+    rested = placement.rest(poses)
     stayed = rested.still and farthest_m(drop.starts, poses, rested.poses) <= STAYED_M
     return Ending(drop, placement, rested.poses) if stayed else None
 
 
 def _place(drop: Drop, poses: Sequence[Pose], forms: Sequence[Form]) -> Placement:
-    return place(drop.starts, poses, forms, drop.table, drop.physics.friction**2)
+    return place(drop.starts, poses, forms, drop.table, drop.physics)
 
 
 def _stand(drop: Drop, outcome: Outcome, seconds: float) -> Ending | None:
@@ -271,7 +270,7 @@ def _stand(drop: Drop, outcome: Outcome, seconds: float) -> Ending | None:
     if T is None:
         return None
     T = translation(0.0, 0.0, -vertical_gap(placed_mesh(start, T), table.mesh)) @ T
-    placement = place_on_top(start, T, table, drop.physics.friction**2)
+    placement = place_on_top(start, T, table, drop.physics)
     return Ending(drop, placement, (T,), seconds, outcome.speed_m_s, bool(outcome.spinning))
 
 

@@ -19,7 +19,7 @@ from schemas.job.cameras import SPHERE_SHARE, VIEW_PRESETS, Cameras, Mirror, Mor
 from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, ScenePlan
 from schemas.scene.view import VIEW_ROLES, Camera, Intrinsics, NamedCamera, Role
-from workers.assets.poses import PoseFile, read_poses
+from workers.assets.poses import PoseFile, poses_of
 from workers.assets.winding import winding_numbers
 from workers.geometry.camera import NEAR_M, look_at, orbit_pose, project, yaw
 from workers.geometry.frames import UP, half_turn, invert, pose, rotation_about, transform, translation
@@ -119,7 +119,7 @@ def _frame(
     job: Job, plan: ScenePlan, camera: Camera, placed: Sequence[tuple[ObjectStart, Pose]], share: float
 ) -> Camera:
     """The camera as near to the middle of the objects as `share`, the picture's edges and the range of depth allow."""
-    points = np.concatenate([transform(T, start.hull.vertices) for start, T in placed])
+    points = points_of(plan, [T for _, T in placed])
     lower, upper = points.min(axis=0), points.max(axis=0)
     middle, size, k = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower)), camera.intrinsics
     if any(job.cameras.orbit.aim_m):  # what was drawn stands one metre from the point that it looks at
@@ -176,22 +176,56 @@ def place_more(
 
     tables: of entries that a file has, by name.
 
-    Raises ViewError where one stands below the floor, or inside of an object or of the table.
+    Raises ViewError where one stands below the floor, or inside of an object or of the table, or as `require_depth`.
     """
+    points = points_of(plan, poses)
     for entry in job.cameras.more:
-        if entry.beside is None:
-            rng = chance.stream(Stream.MORE, crc32(entry.name.encode()))
-            k = intrinsics_of(entry, Intrinsics.of(job.cameras.sensor))
+        named: Iterator[NamedCamera] = place_orbits(job, entry, chance, plan, points)
+        if entry.poses is not None:
+            others = intrinsics_of(entry, Intrinsics.of(job.cameras.sensor))
+            of_object, rows = poses_of(tables[entry.name], plan.scene_id)
+            T_world = poses[0] if of_object else np.eye(4)
+            stands = ((T_world @ T, own or others) for T, own in rows)
+            named = (NamedCamera(entry.name, n, Camera(k, frozen_array(T))) for n, (T, k) in enumerate(stands))
+        for each in named:
+            _require_room(
+                each.name, each.number, each.camera.position, plan, poses, IN_TABLE if entry.poses else ON_ORBIT
+            )
             if entry.poses is None:
-                placed, first = _Placed.of(plan, poses), plan.input_cameras[0]
-                stands = ((T, k) for T in _stands(entry, rng, placed, k, first, job.images.depth_range_m))
-            else:
-                table = read_poses(tables[entry.name])
-                T_world = poses[0] if table.of_object else np.eye(4)
-                stands = ((T_world @ T, own or k) for T, own in table.of_scene(plan.scene_id))
-            for number, (T, own) in enumerate(stands):
-                _require_room(entry.name, number, T[:3, 3], plan, poses, IN_TABLE if entry.poses else ON_ORBIT)
-                yield NamedCamera(entry.name, number, Camera(own, frozen_array(T)))
+                require_depth(job, each, points)
+            yield each
+
+
+def points_of(plan: ScenePlan, poses: Sequence[Pose]) -> Array:
+    """[N, 3]: the vertices of the objects' hulls, world."""
+    return np.concatenate([transform(T, each.hull.vertices) for each, T in zip(plan.objects, poses, strict=True)])
+
+
+def place_orbits(job: Job, entry: More, chance: SceneChance, plan: ScenePlan, points: Array) -> Iterator[NamedCamera]:
+    """The cameras of an entry's rings and spheres; points: `points_of` the scene."""
+    rng = chance.stream(Stream.MORE, crc32(entry.name.encode()))
+    k, placed = intrinsics_of(entry, Intrinsics.of(job.cameras.sensor)), _Placed.of(plan, points)
+    stands = _stands(entry, rng, placed, k, plan.input_cameras[0], job.images.depth_range_m)
+    for number, T in enumerate(stands):
+        yield NamedCamera(entry.name, number, Camera(k, frozen_array(T)))
+
+
+def require_depth(job: Job, named: NamedCamera, points: Array) -> None:
+    """Raises ViewError `not_framed` where some of `points` [N, 3], world, are in the picture, and too near or far for depth."""
+    local, k = transform(invert(named.camera.T_world_cam), points), named.camera.intrinsics
+    near_m, far_m = max(NEAR_M, job.images.depth_range_m.low), job.images.depth_range_m.high
+    ahead = local[local[:, 2] > 0.0]
+    u, v = project(ahead, k)
+    depths = ahead[(u > 0.0) & (u < k.width) & (v > 0.0) & (v < k.height), 2]
+    if len(depths) and not near_m < depths.min() <= depths.max() < far_m:
+        remedies = ["widen images.depth_range_m"] if depths.min() > NEAR_M else []
+        metric = job.scene == "studio" and job.studio.scale == "metric"
+        remedies.append("set studio.scale: unit_sphere" if metric else "let it stand elsewhere")
+        raise ViewError(
+            "not_framed",
+            f"camera {named.name}, number {named.number}, has the objects {depths.min():.3g} to {depths.max():.3g} m before it, "
+            f"and has depth from {near_m:g} to {far_m:g} m: {', or '.join(remedies)}",
+        )
 
 
 def place_fixed(job: Job, seen_from: Mapping[Role, Camera]) -> Iterator[NamedCamera]:
@@ -225,8 +259,7 @@ class _Placed:
     top: Array
 
     @classmethod
-    def of(cls, plan: ScenePlan, poses: Sequence[Pose]) -> "_Placed":
-        points = np.concatenate([transform(T, each.hull.vertices) for each, T in zip(plan.objects, poses, strict=True)])
+    def of(cls, plan: ScenePlan, points: Array) -> "_Placed":
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
         radius_m = float(np.linalg.norm(points - middle, axis=1).max())
         side_m = float(np.ptp(points, axis=0).max())  # as it lies: published methods measure it after they placed it

@@ -195,8 +195,9 @@ def scene_row(context: WorkerContext, scene: Scene) -> Row:
     """The row of `scenes`: names of the first object, and the worst figures of all objects."""
     ran, skipped = write_receipt(scene.effects, scene.called)
     table = None if scene.plan.ground is None else scene.plan.table
-    posed = list(zip(scene.plan.objects, scene.settled, strict=True))
-    bodies = [body_columns(start, rest) for start, rest in posed if not start.is_clutter]
+    friction_of = context.job.physics.friction_of if table and context.job.physics.varies else lambda _: None
+    posed = [both for both in zip(scene.plan.objects, scene.settled, strict=True) if not both[0].is_clutter]
+    bodies = [body_columns(start, rest, friction_of(start.asset.category)) for start, rest in posed]
     return {
         "scene_id": scene.plan.scene_id,
         "table_id": None if table is None else table.asset.instance_id,

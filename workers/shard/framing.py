@@ -13,7 +13,7 @@ from schemas.scene.view import Camera
 from workers.assets.catalogue import Catalogue
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, transform, translation
-from workers.scene.cameras import frame_cameras, place_mirror_camera
+from workers.scene.cameras import frame_cameras, place_mirror_camera, place_orbits, points_of, require_depth
 from workers.scene.chance import SceneChance
 from workers.scene.plan import plan_scene
 
@@ -36,6 +36,10 @@ def require_framed(job: Job, catalogue: Catalogue) -> None:
             plan = frame_cameras(job, plan, poses)
             placed = zip(plan.objects, poses, strict=True)
             unseen = [_unseen(job, *pair, camera) for pair, camera in product(placed, plan.input_cameras)]
+            points = points_of(plan, poses)
+            for entry in job.cameras.more if plan.ground is None else ():  # on a table, objects lie otherwise at rest
+                for camera in place_orbits(job, entry, SceneChance(job.seed, scene_id), plan, points):
+                    require_depth(job, camera, points)
         except SceneError as error:
             unseen = [error.detail]
         if "" in unseen:

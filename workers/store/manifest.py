@@ -4,14 +4,15 @@ The same rows in the same order give the same digest, however stored. Each colum
 present (one byte each), lengths of strings and lists, and the values themselves (doubles as IEEE-754 little-endian, so -0.0 is
 not 0.0; integers as 8 bytes little-endian; booleans as one byte; strings as UTF-8). A missing value counts as absent and as
 zero or empty; items below an absent list are left out. A column's digest is the hash of its streams' digests, a table's digest
-the hash of its name, its number of rows and its columns in the order of the schema, but for those without any value: a later
-column leaves older digests as they are. It does not depend on how rows were cut into batches.
+the hash of its name, its number of rows and its columns in the order of the schema, but for those without any value, and for
+fields inside them that one kind of dataset alone has: a later column leaves older digests as they are. It does not depend on
+how rows were cut into batches.
 """
 
 import hashlib
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import Any, cast, get_args
 
@@ -24,6 +25,7 @@ from schemas.dataset.commit import FileEntry, Outcome
 from schemas.dataset.layout import asset_path, is_glb, is_plain_path
 from schemas.dataset.tables import (
     DETERMINISTIC_TABLES,
+    OF_SOME,
     SCHEMAS,
     SHAPE_FILE_COLUMNS,
     SORT_KEYS,
@@ -292,25 +294,31 @@ _PRIMITIVES: dict[pa.DataType, tuple[str, float | bool]] = {
 class _Stream:
     """The running digest of one column, or of one level of a nested column."""
 
-    def __init__(self, kind: pa.DataType) -> None:
+    def __init__(self, kind: pa.DataType, path: str, optional: Collection[str]) -> None:
         self._kind = kind
+        self._stays = path not in optional
         self.some = False
         """Whether there was a value."""
         self._present = hashlib.sha256()
         self._lengths = hashlib.sha256()
         self._values = hashlib.sha256()
-        self._children = [_Stream(kind.field(i).type) for i in range(kind.num_fields)]
+        self._children = {
+            kind.field(i).name: _Stream(
+                kind.field(i).type, f"{path}[]" if _is_list(kind) else f"{path}.{kind.field(i).name}", optional
+            )
+            for i in range(kind.num_fields)
+        }
 
     def update(self, array: pa.Array) -> None:
         """Takes the next values of the column."""
         self.some |= array.null_count < len(array)
         self._present.update(_bytes_of(array.is_valid(), "|u1"))
         if pa.types.is_struct(self._kind):
-            for child, part in zip(self._children, array.flatten(), strict=True):
+            for child, part in zip(self._children.values(), array.flatten(), strict=True):
                 child.update(part)
         elif _is_list(self._kind):
             self._lengths.update(_bytes_of(pc.fill_null(pc.list_value_length(array), 0), "<i8"))
-            self._children[0].update(array.flatten())
+            next(iter(self._children.values())).update(array.flatten())
         elif pa.types.is_string(self._kind):
             filled = pc.fill_null(array, "")
             self._lengths.update(_bytes_of(pc.binary_length(filled), "<i8"))
@@ -322,7 +330,19 @@ class _Stream:
     def digest(self) -> bytes:
         """[32] bytes: of all values so far."""
         streams = [stream.digest() for stream in (self._present, self._lengths, self._values)]
-        return hashlib.sha256(b"".join([*streams, *(child.digest() for child in self._children)])).digest()
+        return hashlib.sha256(b"".join([*streams, *(child.digest() for child in self._kept().values())])).digest()
+
+    def tag(self) -> str:
+        """A name of the type, of what is digested, that does not change with Arrow's version."""
+        tags = {name: child.tag() for name, child in self._kept().items()}
+        if pa.types.is_struct(self._kind):
+            return "{" + ",".join(f"{name}:{tag}" for name, tag in tags.items()) + "}"
+        if tags:
+            return f"[{''.join(tags.values())}]"
+        return "text" if pa.types.is_string(self._kind) else _PRIMITIVES[self._kind][0]
+
+    def _kept(self) -> "dict[str, _Stream]":
+        return {name: child for name, child in self._children.items() if child.some or child._stays}
 
 
 class TableDigest:
@@ -331,7 +351,7 @@ class TableDigest:
     def __init__(self, table: str) -> None:
         self._name = table
         self._schema = SCHEMAS[table]
-        self._streams = [_Stream(field.type) for field in self._schema]
+        self._streams = [_Stream(field.type, field.name, OF_SOME[table]) for field in self._schema]
         self.rows = 0
 
     def update(self, rows: pa.Table | pa.RecordBatch) -> None:
@@ -346,7 +366,7 @@ class TableDigest:
         total = hashlib.sha256(f"verso rows 1\n{self._name}\n{self.rows}\n".encode())
         for stream, field in zip(self._streams, self._schema, strict=True):
             if stream.some:
-                total.update(f"{field.name}\n{_tag(field.type)}\n".encode() + stream.digest())
+                total.update(f"{field.name}\n{stream.tag()}\n".encode() + stream.digest())
         return total.hexdigest()
 
 
@@ -382,15 +402,6 @@ def text_bytes(array: pa.StringArray) -> bytes:
 
 def _is_list(kind: pa.DataType) -> bool:
     return bool(pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind))
-
-
-def _tag(kind: pa.DataType) -> str:
-    """A type's name that does not change with Arrow's version."""
-    if pa.types.is_struct(kind):
-        return "{" + ",".join(f"{kind.field(i).name}:{_tag(kind.field(i).type)}" for i in range(kind.num_fields)) + "}"
-    if _is_list(kind):
-        return f"[{_tag(kind.value_type)}]"
-    return "text" if pa.types.is_string(kind) else _PRIMITIVES[kind][0]
 
 
 def _bytes_of(array: pa.Array, dtype: str) -> bytes:

@@ -4,12 +4,15 @@ Conventions are those of derive.py. What is drawn at random is held to its bound
 turn of a whole sphere does, is taken from the first view, and all others must follow from it.
 """
 
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pyarrow import dataset
 
 from services.read.independent.rays import NEAR_M, Array
 
@@ -53,15 +56,46 @@ PRESETS: Mapping[str, tuple[float, str, float, Sequence[Entry]]] = {
 
 
 def sensor_of(entry: Entry, sensor: Entry) -> Entry:
-    """The pinhole camera of an entry by name; nothing where a table of poses may say it."""
-    if entry["poses"] is not None:
-        return {}
+    """The pinhole camera of an entry by name."""
     sensor = entry["sensor"] or sensor
     fov_deg = entry["fov_deg"] or (PRESETS[entry["preset"]][0] if entry["preset"] else None)
     if fov_deg is None:
         return sensor
     focal = sensor["width"] / 2.0 / math.tan(math.radians(fov_deg) / 2.0)
     return {**sensor, "fx": focal, "fy": focal}
+
+
+PINHOLE = ("width", "height", "fx", "fy", "cx", "cy")
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """A row of a table of poses: T [4, 4], camera to world, or to the first object; the pinhole camera, where it has one."""
+
+    T: Array
+    of_object: bool
+    pinhole: Entry
+
+
+def read_stands(path: Path, scene_id: int) -> list[Stand]:
+    """The rows of a scene in a table (.csv, .parquet, .json), in order; without scene_id every scene has all."""
+    if path.suffix.lower() == ".json":
+        rows = [row for row in json.loads(path.read_bytes()) if row.get("scene_id", scene_id) == scene_id]
+    else:
+        table = dataset.dataset(path, format=path.suffix.lower()[1:])
+        only = dataset.field("scene_id") == scene_id if "scene_id" in table.schema.names else None
+        rows = table.to_table(filter=only, use_threads=False).to_pylist()
+    return [_stand(row) for row in rows]
+
+
+def _stand(row: Entry) -> Stand:
+    """R (R^T R)^(-1/2) is the rotation that is nearest to R, by its polar decomposition."""
+    frame = next((name for name in ("T_world_cam", "T_obj_cam") if name in row), "")
+    given = row[frame] if frame else [row[f"T{i}{j}"] for i in range(4) for j in range(4)]
+    T = np.reshape(json.loads(given) if isinstance(given, str) else given, (4, 4)).astype(np.float64)
+    squares, axes = np.linalg.eigh(T[:3, :3].T @ T[:3, :3])
+    T[:3, :3], T[3] = T[:3, :3] @ (axes / np.sqrt(squares)) @ axes.T, (0.0, 0.0, 0.0, 1.0)
+    return Stand(T, frame == "T_obj_cam", {name: row[name] for name in PINHOLE if name in row})
 
 
 def orbits_of(entry: Entry) -> Sequence[Entry]:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from services.read.independent.cameras import sensor_of
+from services.read.independent.cameras import Stand, sensor_of
 from services.read.independent.rays import Array, Faces, Row, bare_faces, place_shapes, read_shape
 
 ROUNDING = 1e-9
@@ -89,6 +89,9 @@ class StoredPair:
     given: tuple[Sequence[tuple[str | None, Array | None]], Sequence[Array]] | None = None
     """Instances and poses of objects, and poses of cameras, that the table of scenes has; None where it is not at hand."""
 
+    stands: Mapping[str, Sequence[Stand]] = field(default_factory=dict)
+    """Rows of tables of poses that are at hand, by camera."""
+
     @property
     def is_captured(self) -> bool:
         """Whether the input view is a photograph: it stands where it was taken, by a camera of its own."""
@@ -116,7 +119,7 @@ class StoredPair:
         return {row["region_id"]: row for row in self.objects if name_of(row) == name_of(view)}
 
     def sensor(self, view: Row) -> Mapping[str, Any]:
-        """The pinhole camera of a view: the job's, or the input view's; nothing where a table of poses may say it.
+        """The pinhole camera of a view: the job's, or the input view's; nothing where a table not at hand may say it.
 
         The latter of captures, and where a table of scenes has the cameras.
         """
@@ -124,7 +127,10 @@ class StoredPair:
         entry = self.named.get(view["role"])
         if self.is_captured or (self.has_given_cameras and (entry is None or entry["beside"])):
             sensor = {name: self.views["input"][name] for name in sensor}
-        return sensor if entry is None else sensor_of(entry, sensor)
+        if entry is None or not entry["poses"]:
+            return sensor if entry is None else sensor_of(entry, sensor)
+        row = self.stands.get(entry["name"], ())[view["number"] : view["number"] + 1]
+        return (row[0].pinhole or sensor_of(entry, sensor)) if row else {}
 
     @property
     def targets(self) -> Mapping[str, Any]:

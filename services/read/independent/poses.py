@@ -6,7 +6,7 @@ imports nothing else of the project: rows come as dictionaries, files as bytes. 
 
 import math
 import urllib.parse
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -116,17 +116,24 @@ def check_poses(pair: StoredPair) -> Iterator[str]:
 
 
 def check_named(pair: StoredPair) -> Iterator[str]:
-    """The cameras that a job names: how many a scene's first pair has, and where they stand, but for those of a table."""
+    """The cameras that a job names: how many a scene's first pair has, and where they stand; of a table where it is at hand."""
     is_first = pair.views["input"]["pose_id"] == 2 * pair.job["pairs_per_scene"] * pair.scene["scene_id"]
     subject = None
     for name, entry in pair.named.items():
         views = sorted((view for view in pair.views.values() if view["role"] == name), key=lambda view: view["number"])
         standing = is_first and not entry["beside"]
-        count = len(views) if entry["poses"] else sum(orbit["count"] for orbit in orbits_of(entry)) if standing else 0
-        count = 1 if entry["beside"] else count
+        count = sum(orbit["count"] for orbit in orbits_of(entry)) if standing else int(bool(entry["beside"]))
+        if standing and entry["poses"]:
+            count = len(pair.stands.get(name, views))
         if [view["number"] for view in views] != list(range(count)) or bool(views) != (standing or count == 1):
             yield f"has {len(views)} views of camera {name}, and must have {count}, numbered from 0"
-        elif standing and not entry["poses"]:
+        elif standing and entry["poses"]:
+            T_world_obj = matrix(pair.bodies[0], "T_world_obj")
+            for view, stand in zip(views, pair.stands.get(name, ()), strict=False):
+                T = T_world_obj @ stand.T if stand.of_object else stand.T
+                if not (off := distance(matrix(view, "T_world_cam"), T)) <= ROUNDING:
+                    yield f"T_world_cam of {name_of(view)} is off by {off:.3g} from its row in {entry['poses']}"
+        elif standing:
             try:
                 subject = subject or _subject(pair)
             except FileNotFoundError as error:
@@ -184,8 +191,8 @@ _CAMERA_COLUMNS = (
 )
 
 
-def list_underived(job: Mapping[str, Any]) -> list[str]:
-    """Stored values that have no second derivation for this job, a sentence each."""
+def list_underived(job: Mapping[str, Any], at_hand: Collection[str]) -> list[str]:
+    """Stored values that have no second derivation for this job, a sentence each; at_hand: cameras whose tables are."""
     lines = ["visible_fraction, mirror_agreement and projected_hidden_share are not derived"]
     sensor, projection = job["sensor"], job["images"]["projection"]
     if job.get("captures") is not None:
@@ -196,8 +203,11 @@ def list_underived(job: Mapping[str, Any]) -> list[str]:
         lines.append("projected images are not derived: images.projection.splat or hidden_point_removal is on")
     elif projection["enabled"] and sensor["distortion"]:
         lines.append("colours of projected images are not derived: sensor.distortion is on")
-    if tables := [entry["name"] for entry in job["cameras"]["more"] if entry["poses"]]:
-        lines.append(f"poses of {', '.join(tables)} are not derived: a table of poses has them")
+    lines += [
+        f"poses of {entry['name']} are not derived: {entry['poses']} is not here, or not what it was when the job was run"
+        for entry in job["cameras"]["more"]
+        if entry["poses"] and entry["name"] not in at_hand
+    ]
     if sensor["depth_noise"]:
         lines.append("depth is not compared with the floor's plane: sensor.depth_noise is on")
     look = job.get("look", {})
@@ -294,6 +304,9 @@ KEPT = "kept_poses"
 
 GRAVITY_M_S2 = 9.81
 
+FRICTION, MOST_FRICTION = 0.7, 10.0
+"""Of what a map of coefficients does not name; and that of a contact at most."""
+
 SHARE = 0.01
 """Of a weight, or of a weight at the lever of the farthest contact: what may be without balance."""
 
@@ -304,14 +317,28 @@ def check_forces(job: Mapping[str, Any], scene: Row) -> Iterator[str]:
     falls = job.get("captures") is None and job.get("scene") != "studio"
     if not bodies or not falls or not job["physics"]["exact_rest"]:
         return
-    friction = job["physics"]["friction"] ** 2
+    where, frictions = f"scene {scene['scene_id']}", {TABLE: _friction_of(job, "table")}
+    for body in (scene.get("surroundings") or {}).get("clutter") or ():
+        frictions[body["region_id"]] = _friction_of(job, body["category"])
     for body in bodies:
-        for fault in _check_body(body, friction):
-            yield f"scene {scene['scene_id']}, region {body['region_id']}: {fault}"
-    yield from (f"scene {scene['scene_id']}: {fault}" for fault in _check_reactions(bodies))
+        expected, stored = _friction_of(job, body["category"]), body.get("friction")
+        frictions[body["region_id"]] = expected if stored is None else stored
+        if stored != (expected if isinstance(job["physics"]["friction"], dict) else None):
+            yield f"{where}, region {body['region_id']}: its friction is {stored}, and physics.friction gives {expected:g}"
+    for body in bodies:
+        others = np.array([frictions.get(contact["with_region"], math.inf) for contact in body["contacts"]])
+        friction = np.minimum(frictions[body["region_id"]] * others, MOST_FRICTION)
+        yield from (f"{where}, region {body['region_id']}: {fault}" for fault in _check_body(body, friction))
+    yield from (f"{where}: {fault}" for fault in _check_reactions(bodies))
 
 
-def _check_body(body: Row, friction: float) -> Iterator[str]:
+def _friction_of(job: Mapping[str, Any], category: str) -> float:
+    """The coefficient of a body of this category, or of the table."""
+    given = job["physics"]["friction"]
+    return float(given.get(category, FRICTION) if isinstance(given, dict) else given)
+
+
+def _check_body(body: Row, friction: Array) -> Iterator[str]:
     contacts = body["contacts"]
     if not contacts:
         yield "nothing holds it"
@@ -330,8 +357,8 @@ def _check_body(body: Row, friction: float) -> Iterator[str]:
     slipping = np.linalg.norm(force - pressed[:, None] * normal, axis=1)
     if (pressed < -ROUNDING * weight).any():
         yield "a contact pulls"
-    if (slipping > friction * pressed + ROUNDING * weight).any():
-        yield f"a contact needs more than its friction of {friction:g}"
+    if not (holds := slipping <= friction * pressed + ROUNDING * weight).all():
+        yield f"a contact needs more than its friction of {friction[~holds].min():g}"
 
 
 def _check_reactions(bodies: list[Row]) -> Iterator[str]:

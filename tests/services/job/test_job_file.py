@@ -76,6 +76,9 @@ FAULTS: tuple[tuple[str | bytes, list[str]], ...] = (
         ["start.pose: 'uprigth': did you mean 'upright'? must be 'upright', 'tumbled', 'placed' or"],
     ),
     ("assets: {density_kg_m3: {mug: -1}}", ["assets.density_kg_m3.mug: -1: must be greater than 0"]),
+    ("assets: {density_kg_m3: {table: 1}}", ["assets.density_kg_m3.table: 'table': the name of what objects stand on"]),
+    ("physics: {friction: {mug: 6}}", ["physics.friction.mug: 6: must be at most 5"]),
+    ("physics: {friction: {mgu: 1}}", ["physics.friction.mgu: no source offers it; did you mean 'mug'?", "box, table"]),
     ("cameras: {depth: {offset_m: [0, 0, x]}}", ["cameras.depth.offset_m.2: 'x'"]),
     *(
         (

@@ -2,14 +2,19 @@
 
 import copy
 import dataclasses
+import json
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import services.merge.tables as tables
+import workers.assets.poses as poses
 import workers.geometry.camera as camera
 import workers.geometry.pixels as pixels
 import workers.geometry.projection as projection
@@ -24,6 +29,7 @@ from services.read.independent.poses import check_forces
 from tests.captures import CAMERA, captures_job, exact_capture, use_exact_captures
 from tests.datasets import faults_of, make_dataset, overlaid, run_here
 from workers.capture import make_capture, rows
+from workers.geometry.camera import look_at
 from workers.geometry.frames import pose, rotation_about, translation
 from workers.render.raster.gbuffer import shared_renderer
 from workers.shard.fingerprint import take_fingerprint
@@ -71,6 +77,7 @@ HEALTHY = {
         "pairs_per_scene": 2,
         "cameras": {"mirror": {"T_z_m": 1.1, "percentile": 0.0}},
     },
+    "frictions": {"physics": {"friction": {"mug": 0.3, "table": 1.2}}, "objects_per_scene": 2},
     "median, tar": {"cameras": {"mirror": {"percentile": 50.0}}, "output": {"layout": "tar"}},
     "no mirror": {"cameras": {"mirror": {"enabled": False}}, "images": {"projection": {"enabled": False}}},
     "no colour": {"cameras": {"depth": {"enabled": False}}, "render": {"rgb": False}},
@@ -255,6 +262,51 @@ def no_alpha_inside(rgb, region, alpha):
     return np.dstack([rgb, np.where(alpha == 255, 0, alpha)])
 
 
+def tables_of_poses(folder: Path) -> list[dict[str, Any]]:
+    """A camera of each form of table: rounded to five digits, of an object, with pinholes, scenes between one another."""
+    stands = [
+        look_at(np.array([x, 0.7, z]), np.zeros(3)) for x, z in ((0.4, 0.5), (-0.3, 0.9), (0.1, 1.0), (-0.6, 0.4))
+    ]
+    rows = [
+        {"scene_id": n % 2, "T_obj_cam": np.round(T, 5).ravel().tolist(), "more": "x"} for n, T in enumerate(stands)
+    ]
+    pinhole = {"width": 90, "height": 70, "fx": 80.5, "fy": 81, "cx": 45, "cy": 33.5}
+    pq.write_table(pa.Table.from_pylist(rows), folder / "object.parquet")
+    world = look_at(np.array([0.1, 0.8, 1.7]), np.array([0.0, 0.0, 0.8]))
+    (folder / "world.json").write_text(json.dumps([{"T_world_cam": world.tolist(), **pinhole}]))
+    elements = [f"T{i}{j}" for i in range(4) for j in range(4)]
+    (folder / "list.csv").write_text("\n".join(",".join(map(str, line)) for line in (elements, world.ravel())))
+    return [
+        {"name": name.partition(".")[0], "poses": str(folder / name)}
+        for name in ("object.parquet", "world.json", "list.csv")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda stands: stands, ""),
+        (lambda stands: stands[::-1], "T_world_cam of object_000 is off by"),
+        (
+            lambda stands: [(T @ translation(0.0, 0.0, 1e-6), k) for T, k in stands],
+            "T_world_cam of list_000 is off by ",
+        ),
+        (lambda stands: [(T, None) for T, _ in stands], "(world_000): width is 160, the job gives 90"),
+        (lambda stands: stands[:1], "has 1 views of camera object, and must have 2"),
+    ],
+)
+def test_poses_of_a_table_are_derived_from_the_file_at_hand(tmp_path, monkeypatch, wrong, message):
+    more, of_scene = tables_of_poses(tmp_path), poses.Poses.of_scene
+    monkeypatch.setattr(poses.Poses, "of_scene", lambda self, scene_id: iter(wrong(list(of_scene(self, scene_id)))))
+    store, _ = make_dataset(tmp_path / "out", cameras={"more": more})
+    found = verify_independently(store, 2, lambda _: None)
+    assert any(message in fault for fault in found.faults) if message else found.faults == []
+    assert not any("poses of" in line for line in found.underived)
+    (tmp_path / "list.csv").write_text((tmp_path / "list.csv").read_text() + " ")
+    lines = verify_independently(store, 2, lambda _: None).underived
+    assert any("list.csv is not here, or not what it was" in line for line in lines)
+
+
 WRONG_NAMED: dict[str, tuple[object, str, Callable[[Any], object], dict[str, Any], str]] = {
     "beside": (
         cameras,
@@ -436,8 +488,8 @@ LOW_CONTACTS = [contact(2, [x, 0.0, 0.0], [0.0, 0.0, (LOW + HIGH) / 2]) for x in
 LOW_CONTACTS += [contact(4, [x, 0.0, 0.2], [0.0, 0.0, -HIGH / 2], DOWN) for x in (-0.05, 0.05)]
 HIGH_CONTACTS = [contact(3, [x, 0.0, 0.2], [0.0, 0.0, HIGH / 2]) for x in (-0.05, 0.05)]
 BODIES = [
-    {"region_id": 3, "mass_kg": 2.0, "com": [0.0, 0.0, 0.1], "contacts": LOW_CONTACTS},
-    {"region_id": 4, "mass_kg": 1.0, "com": [0.0, 0.0, 0.3], "contacts": HIGH_CONTACTS},
+    {"region_id": 3, "category": "box", "mass_kg": 2.0, "com": [0.0, 0.0, 0.1], "contacts": LOW_CONTACTS},
+    {"region_id": 4, "category": "mug", "mass_kg": 1.0, "com": [0.0, 0.0, 0.3], "contacts": HIGH_CONTACTS},
 ]
 """A body of 1 kg on one of 2 kg, each held at two points."""
 
@@ -466,7 +518,7 @@ def test_forces_of_a_scene_in_balance_have_no_fault_and_each_wrong_one_is_told()
     def faults(edit: Callable, job: dict = JOB) -> str:
         bodies = copy.deepcopy(BODIES)
         edit(*bodies)
-        return "; ".join(check_forces(job, {"scene_id": 7, "bodies": bodies}))
+        return "; ".join(check_forces(job, {"scene_id": 7, "bodies": bodies, "effects": []}))
 
     assert faults(lambda low, high: None) == ""
     for edit, told in (
@@ -479,5 +531,26 @@ def test_forces_of_a_scene_in_balance_have_no_fault_and_each_wrong_one_is_told()
         (lambda low, high: low["contacts"][0].update(normal=[0.0, 0.0, 1.001]), "has not the length 1"),
     ):
         assert told in faults(edit)
+    given = {"box": 2.0, "mug": 0.25}  # the table has 0.7: on it the box has 1.4, under the mug 0.5
+
+    def leaning(box: float | None, mug: float | None, most: float, pushed: int, job: Any = given) -> str:
+        """The mug pushed aside by 0.4 of what presses it, or the box by `most` less a thousandth, both ways."""
+
+        def edit(low, high):
+            low["friction"], high["friction"] = box, mug
+            for k, sign in ((0, 1), (1, -1)):
+                first = (low if pushed == 3 else high)["contacts"]
+                first[k]["force"][0] = sign * (most - 1e-3) * first[k]["force"][2]
+                if pushed == 4:
+                    low["contacts"][k + 2]["force"][0] = -first[k]["force"][0]
+
+        return faults(edit, {"physics": {"friction": job, "exact_rest": True}, "captures": None})
+
+    assert leaning(2.0, 0.25, 1.4, 3) == leaning(2.0, 0.25, 0.5, 4) == ""
+    assert "region 3: a contact needs more than its friction of 1.4" in leaning(2.0, 0.25, 1.402, 3)
+    assert "region 4: a contact needs more than its friction of 0.48" in leaning(2.0, 0.24, 0.5, 4)
+    assert "region 4: its friction is 0.24, and physics.friction gives 0.25" in leaning(2.0, 0.24, 0.4, 4)
+    assert "region 3: its friction is None, and physics.friction gives 2" in leaning(None, 0.25, 0.4, 3)
+    assert "region 3: its friction is 2.0, and physics.friction gives 0.7" in leaning(2.0, None, 0.4, 3, 0.7)
     without_rest = {"physics": {"friction": 0.7, "exact_rest": False}, "captures": None}
     assert faults(nothing_below, without_rest) == faults(nothing_below, {**JOB, "captures": {}}) == ""

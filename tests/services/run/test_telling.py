@@ -72,6 +72,15 @@ def test_what_is_left_and_its_cost_are_told_and_nothing_is_made(tmp_path):
             {"cameras.orbit.radius_m": "fit", "cameras.mirror.T_z_m": "fit", "images.depth_range_m": [3.0, 3.05]},
             r"m across together: the camera that frames them .* 3 to 3\.05 m",
         ),
+        (
+            {
+                "scene": "studio",
+                "studio.scale": "metric",
+                "images.depth_range_m": [0.8, 8.0],
+                "cameras.more": [{"name": "a", "preset": "trellis"}],
+            },
+            r"camera a, number 0, has the objects 0\.\d+ to 0\.\d+ m before it, .* 0\.8 to 8 m: widen images.* or set studio",
+        ),
         ({"start.offset_m": [3, 4]}, r"none of 21 positions .* narrow start\.offset_m"),
     ],
 )

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from schemas.job.physics import Physics
 from schemas.scene.scene import ObjectStart, Table
 from schemas.scene.shape import REGION_TABLE, Mesh
 from tests.hard_cases.bodies import cube
@@ -229,7 +230,7 @@ CUBE = box((0.1, 0.1, 0.1))
 def settle(meshes: list[Mesh], poses, ground: Mesh = GROUND, masses=None) -> Rested:
     masses = masses or [1.0] * len(meshes)
     things = [thing_of(mesh, mass) for mesh, mass in zip(meshes, masses, strict=True)]
-    return rest(things, poses, surface_of(ground, True), 0.49)
+    return rest(things, poses, surface_of(ground, True), np.full(len(things) + 1, 0.7))
 
 
 def on_ground(mesh: Mesh, R, up_m: float = 0.0):
@@ -347,8 +348,8 @@ TOP = TABLE.top.height_m
 STARTED = start_at(cube())
 
 
-def held(start: ObjectStart, T: np.ndarray, on: Table = TABLE, friction: float = 0.5) -> Support:
-    return measure_supports(place([start], [T], forms([start]), on, friction), [T])[0]
+def held(start: ObjectStart, T: np.ndarray, on: Table = TABLE) -> Support:
+    return measure_supports(place([start], [T], forms([start]), on, Physics()), [T])[0]
 
 
 def test_a_box_on_a_level_is_held_by_corners_of_its_face_with_a_margin_of_half_its_side():

@@ -132,7 +132,7 @@ def test_what_does_not_rest_is_refused_with_what_was_measured(monkeypatch):
         (hover, TABLE, PHYSICS, "unsupported", r"it came to rest 0.020 mm from anything, with 100.0% of its weight"),
     ):
         if start is hover:
-            monkeypatch.setattr(settle, "rest", lambda things, *_: Rested((hover.T_world_obj,), True, 0))
+            monkeypatch.setattr(Placement, "rest", lambda *_: Rested((hover.T_world_obj,), True, 0))
         with pytest.raises(SettleError, match=words) as caught:
             settle_single(start, on, physics)
         assert caught.value.reason == reason
@@ -270,7 +270,7 @@ HELD_M = HELD[0][2]
 
 
 def released(starts: Sequence[ObjectStart], on: Table, physics=PHYSICS) -> tuple[Drop, Placement]:
-    placement = place(starts, [one.T_world_obj for one in starts], forms_of(starts), on, physics.friction**2)
+    placement = place(starts, [one.T_world_obj for one in starts], forms_of(starts), on, physics)
     return Drop(tuple(starts), on, physics, EffectPlan(("dynamics", "fine_step", "object_contacts"), {})), placement
 
 

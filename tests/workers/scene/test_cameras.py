@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.csv
 import pyarrow.parquet as pq
 import pytest
 import trimesh
@@ -22,7 +23,7 @@ from services.read.dataset_reader import find_scene
 from tests.datasets import faults_of, make_dataset, overlaid
 from tests.effects.scenes import Setting, context_of, make
 from tests.kit.shapes import asset_of, box
-from workers.assets.poses import read_poses
+from workers.assets.poses import open_poses, poses_of, read_poses
 from workers.capture.results import open_sources
 from workers.geometry.camera import look_at
 from workers.geometry.hull import hull_of
@@ -54,6 +55,7 @@ AROUND = (
     | {name: {"preset": name} for name in ("zero123", "zero123plus", "lrm", "trellis")}
     | {"everywhere": {"sphere": {"count": 4, "pattern": "fibonacci"}}}
 )
+SMALL_SENSOR = {"width": 64, "height": 48, "fx": 52.5, "fy": 52.5, "cx": 32.0, "cy": 24.0}
 SCENES = [2, pytest.param(100, marks=pytest.mark.slow)]
 
 
@@ -74,9 +76,9 @@ def test_every_view_of_every_kind_shows_what_rays_meet_and_verifies(tmp_path, sc
     more = [
         entry | {"name": f"cam-{kind}"} | ({"poses": poses} if kind == "poses" else {}) for kind, entry in kinds.items()
     ]
-    sensor = {"width": 64, "height": 48, "fx": 52.5, "fy": 52.5, "cx": 32.0, "cy": 24.0}
     job = {"scene": scene, "scenes": scenes, "check": {"raycast_share": 1.0}, "images": {"depth_range_m": [0.05, 13.0]}}
-    store, _ = make_dataset(tmp_path / "out", **job, cameras={"more": more, "sensor": sensor})
+    job |= {"studio": {"scale": "unit_sphere", "size_m": 0.5}} if scene == "studio" else {}  # all views have depth
+    store, _ = make_dataset(tmp_path / "out", **job, cameras={"more": more, "sensor": SMALL_SENSOR})
     stored = [find_scene(store, scene_id) for scene_id in range(scenes)]
     assert not [row for each in stored for row in each.rows["failures"]]
     assert all(row["raycast_checked"] for each in stored for row in each.rows["scenes"])
@@ -222,6 +224,10 @@ BAD_POSES: dict[str, tuple[object, str]] = {
     "null.parquet": (pa.table({"T_world_cam": pa.array([None], pa.list_(pa.float64()))}), "row 0: T_world_cam is None"),
     "missing.json": ([row(scene_id=0)], "1 of 2 scenes have no row, the first is 1: add theirs"),
     "half.json": ([row(scene_id=0.5)], "row 0: scene_id is 0.5, and must be a whole number"),
+    "late.csv": (
+        "\n".join(["scene_id," + HEAD, *["1," + ",".join(map(str, STANDING.ravel()))] * 20_000, "-1,1" + 15 * ",0"]),
+        "row 20000: scene_id is -1, and must be from 0",
+    ),
     "both.json": ([row(T_obj_cam=[0.0] * 16)], "has the columns T_world_cam and T_obj_cam: give one of them"),
     "part.json": ([row(fx=100)], "has the columns fx: give all of"),
     "pixels.json": ([row(**PINHOLE | {"width": 10.5})], "row 0: width is 10.5, and must be a whole number"),
@@ -267,10 +273,27 @@ def test_a_table_of_poses_is_read_alike_in_every_form_and_its_digest_is_in_the_s
         job = Setting({"cameras": {"more": [{"name": "a", "poses": poses_file(tmp_path, name, content)}]}}).job
         catalogue = open_sources(job, tmp_path)
         digests.add(catalogue.digest)
-        assert np.abs(read_poses(catalogue.poses["a"]).T - T).max() < 1e-12
+        assert np.abs(read_poses(catalogue.poses["a"], 0).T - T).max() < 1e-12
     poses_file(tmp_path, "a.csv", lines.replace("1.6", "1.7"))
     job = Setting({"cameras": {"more": [{"name": "a", "poses": str(tmp_path / "a.csv")}]}}).job
     assert len(digests | {open_sources(job, tmp_path).digest}) == len(forms) + 1
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_of_a_long_table_the_rows_of_a_few_scenes_alone_are_kept_in_their_order(tmp_path, kind):
+    """Row n is of scene n mod 130, n mm up, so that each scene has rows all over the table."""
+    count = 40_000
+    table = {f"T{i}{j}": np.full(count, STANDING[i, j]) for i in range(4) for j in range(4)}
+    table |= {"T23": np.arange(count) / 1e3, "scene_id": np.arange(count) % 130}
+    write = {"csv": pa.csv.write_csv, "parquet": pq.write_table}[kind]
+    write(pa.table(table), tmp_path / f"a.{kind}")
+    job = Setting({"scenes": 130, "cameras": {"more": [{"name": "a", "poses": f"a.{kind}"}]}}).job
+    file = open_poses(job, tmp_path)["a"]
+    for scene_id in (0, 63, 64, 129):
+        heights = [T[2, 3] for T, _ in poses_of(file, scene_id)[1]]
+        assert heights == (np.arange(scene_id, count, 130) / 1e3).tolist()
+    kept = len(read_poses(file, 64).T)
+    assert kept == sum(64 <= n % 130 < 128 for n in range(count))
 
 
 NO_VIEW: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
@@ -303,6 +326,26 @@ def test_a_camera_that_cannot_stand_there_makes_a_failure_that_names_it(name):
     entry, job, told = NO_VIEW[name]
     with pytest.raises(ViewError, match=told):
         make(Setting({**job, "cameras": {"more": [{"name": "a", **entry}]}}))
+
+
+@pytest.mark.parametrize(("preset", "side_m", "exact"), [("syncdreamer", 0.3, True), ("trellis", 0.1, False)])
+def test_a_preset_so_near_to_a_small_metric_object_that_it_has_no_depth_is_a_failure_with_both_remedies(
+    preset, side_m, exact
+):
+    """Sixteen views at 30 degrees of a cube: at yaw 45 its corner is (root 1.5 + 0.5) / 2 of its side before the middle."""
+    cube, more = box(side_m, side_m, side_m), [{"name": "a", "preset": preset}]
+
+    def tried(low_m: float) -> None:
+        images, studio = {"depth_range_m": [low_m, 5.0]}, {"scale": "metric"}
+        make(alone(cube, cameras={"more": more, "sensor": SMALL_SENSOR}, images=images, studio=studio))
+
+    nearest_m = side_m * (1.5 - (math.sqrt(1.5) + 0.5) / 2.0) if exact else 0.2
+    if exact:
+        tried(nearest_m - 1e-6)
+    with pytest.raises(
+        ViewError, match=r"camera a, number \d+, has .* widen images.depth_range_m, or set studio.scale: unit_sphere"
+    ):
+        tried(nearest_m + 1e-6)
 
 
 def test_views_that_miss_the_object_say_so_and_fit_keeps_small_and_flat_things_in_range(tmp_path):
