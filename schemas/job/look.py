@@ -107,6 +107,14 @@ class Look(Frozen):
     def _switch(cls, value: object) -> object:
         return {} if value is True else None if value is False else value
 
+    def asks_for(self, branch: str) -> bool:
+        """Whether a branch has another value than its default."""
+        return bool(getattr(self, branch) != Look.model_fields[branch].default)
+
+    def without(self, *branches: str) -> "Look":
+        """The look with these of its branches off, whatever their defaults."""
+        return self.model_copy(update={name: OFF.get(name) for name in branches}) if branches else self
+
     @property
     def folders(self) -> dict[str, str]:
         """The folders of pictures, by the key that names them."""
@@ -117,6 +125,9 @@ class Look(Frozen):
         }
         return {key: folder for key, folder in named.items() if folder}
 
+
+OFF = {"recolour": "as_made"}
+"""The value of a branch that is off; None of any other."""
 
 OF_COLOUR = ("recolour", "floor", "table", "background")
 """Branches of the look that change colour alone."""

@@ -41,10 +41,11 @@ def recoloured(asset: Asset, recolour: Recolour) -> Asset:
             texture = material.texture
             if texture is not None and id(texture) not in textures:
                 textures[id(texture)] = recolour_texture(texture, rows)
-            colour = tuple(float(c) for c in recolour_colour(*material.base_color[:3], rows))
+            red, green, blue, alpha = material.base_color
+            red, green, blue = recolour_colour(red, green, blue, rows)
             materials[id(material)] = replace(
                 material,
-                base_color=(*colour, material.base_color[3]),
+                base_color=(red, green, blue, alpha),
                 texture=None if texture is None else textures[id(texture)],
             )
         return replace(part, material=materials[id(material)])

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from schemas.capture import CaptureListing, Reconstruction
 from schemas.errors import AssetSourceError, CaptureError, InputError, command_line
 from schemas.job.job import Job
-from schemas.job.look import RECOLOUR_VERSION
+from schemas.job.look import OFF, RECOLOUR_VERSION
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
 from workers.assets.poses import open_poses
 from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW
@@ -178,7 +178,7 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
 
         pictures = open_pictures(look, job_folder)
         further += [f"{key} {one.name} {one.sha256}" for key, some in pictures.items() for one in some]
-    if look.recolour != "as_made":
+    if look.recolour != OFF["recolour"]:
         further.append(f"recolour {look.model_dump_json(include={'recolour'})} {RECOLOUR_VERSION}")
     if further:
         whole = "\n".join([catalogue.digest, *further])

@@ -33,7 +33,7 @@ def hue_of(colours: np.ndarray) -> np.ndarray:
 
 
 def test_each_hue_goes_into_the_nearest_range_in_order_greys_stay_and_saturation_is_bounded():
-    palette = Palette(hue=((0.1, 0.2), (0.55, 0.6), (0.95, 1.0)), saturation=(0.2, 0.6))  # type: ignore[arg-type]
+    palette = Palette(hue=((0.1, 0.2), (0.55, 0.6), (0.95, 1.0)), saturation=(0.2, 0.6))
     rows, hues = palette_rows(palette), np.linspace(0.0, 1.0, 500, endpoint=False)
     assert rows is not None
     for saturation, value in ((0.9, 0.8), (0.15, 0.5)):
@@ -88,7 +88,7 @@ def test_colour_of_surroundings_changes_rgb_alone_and_no_row_but_what_was_drawn(
 
 
 def test_pictures_repeat_after_their_metres_on_every_face_and_no_face_is_moved():
-    plan, surface = facts_of(Setting({})).plan, Surface(folder=PICTURES, tile_m=(0.3, 0.5))  # type: ignore[arg-type]
+    plan, surface = facts_of(Setting({})).plan, Surface(folder=PICTURES, tile_m=(0.3, 0.5))
     look = validate_job({"name": "x", "look": {"floor": {"folder": PICTURES}}}, "x").look
     coat = draw_coat(surface, open_pictures(look, Path())["look.floor.folder"], RNG(3), 0.9)
     texture = coat.material.texture
@@ -120,7 +120,7 @@ def test_a_room_is_seen_where_rays_meet_it_and_its_window_is_on_the_key_lights_s
     room = {"room": {"size_m": [6.0, 6.4], "height_m": [1.2, 1.4]}}
     made = make(Setting({**far, "look": room}))  # raises where depth or masks are not those of rays
     view, (row,) = made.scene.pairs[0].input, made.rows["scenes"]
-    length, width, height = row["surroundings"]["room_m"]  # type: ignore[index]
+    length, width, height = row["surroundings"]["room_m"]
     assert view.region is not None
     pixels = np.nonzero((view.region == REGION_FLOOR) & (view.depth > 0))
     points = unproject(*pixels, view.depth[pixels] / 5000.0, view.camera.intrinsics) @ view.camera.T_world_cam[:3, :3].T
@@ -166,7 +166,7 @@ def test_clutter_is_in_images_masks_and_depth_and_has_no_row():
     assert regions & set(ids)
     for table in ("views", "objects", "scenes"):
         for row in made.rows[table]:
-            assert not {row.get("region_id"), *(body["region_id"] for body in row.get("bodies", ()))} & set(ids)  # type: ignore[attr-defined]
+            assert not {row.get("region_id"), *(body["region_id"] for body in row.get("bodies", ()))} & set(ids)
     assert len(made.rows["objects"]) == len(plain.rows["objects"])
     assert {path.split("/")[-1] for path in made.files} >= {path.split("/")[-1] for path in plain.files}
     starts = [made.scene.plan.objects, plain.scene.plan.objects]
