@@ -94,22 +94,18 @@ def _into(red: float, green: float, blue: float, rows: Array) -> tuple[float, fl
     value = min(value * (1.0 + (factor - 1.0) * saturation), 1.0)
     if saturation > stays:
         saturation = min(saturation, stays + (most - stays) * (saturation - stays) / (1.0 - stays))
-    hue = 6.0 * (hue - np.floor(hue))
-    sector = int(hue)
-    rest = hue - sector
-    low_value = value * (1.0 - saturation)
-    falls, rises = value * (1.0 - saturation * rest), value * (1.0 - saturation * (1.0 - rest))
-    if sector == 0:
-        return value, rises, low_value
-    if sector == 1:
-        return falls, value, low_value
-    if sector == 2:
-        return low_value, value, rises
-    if sector == 3:
-        return low_value, falls, value
-    if sector == 4:
-        return rises, low_value, value
-    return value, low_value, falls
+    return (
+        _channel(5.0 + 6.0 * hue, saturation, value),
+        _channel(3.0 + 6.0 * hue, saturation, value),
+        _channel(1.0 + 6.0 * hue, saturation, value),
+    )
+
+
+@compiled
+def _channel(sixths: float, saturation: float, value: float) -> float:
+    """A channel by its place on the hue's circle, in sixths of a turn."""
+    at = sixths - 6.0 * np.floor(sixths / 6.0)
+    return value * (1.0 - saturation * max(0.0, min(at, 4.0 - at, 1.0)))
 
 
 @compiled_for("f8, f8, f8, const(f8[:,::1])")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from schemas.base import Range
 from schemas.errors import AssetSourceError, JobError, StartError, ViewError
 from schemas.job.job import job_digest
 from schemas.job.look import Palette, Room, Surface
@@ -20,7 +21,7 @@ from tests.effects.cases import ABOVE_THE_HORIZON, PICTURES
 from tests.effects.scenes import Made, Setting, facts_of, make
 from workers.assets.pictures import KEPT_PX, LARGEST_PX, load_picture, open_pictures
 from workers.assets.recolour import palette_rows, recolour_colour, recolour_texture
-from workers.assets.surroundings import cover_floor, cover_table, draw_coat
+from workers.assets.surroundings import build_room, cover_floor, cover_table, draw_coat
 from workers.capture.results import open_sources
 from workers.geometry.camera import unproject
 from workers.geometry.pixels import fill_image
@@ -129,11 +130,12 @@ def test_a_room_is_seen_where_rays_meet_it_and_its_window_is_on_the_key_lights_s
     assert up.any() and points[:, 2].max() < height + 0.01
     outside = np.abs(points[up, :2]) - 0.5 * np.array([length, width])
     assert (np.abs(outside).min(axis=1) < 0.15).all() and outside.max() < 0.12
-    ground = made.scene.plan.ground
-    assert ground is not None and ground.walls is not None
-    (pane,) = (part for part in ground.walls.shape.parts if part.name == "window")
-    light, middle = made.scene.plan.appearance.lights[0].direction[:2], pane.vertices.mean(axis=0)[:2]
-    assert middle @ light / np.linalg.norm(middle) / np.linalg.norm(light) > 0.8
+    for azimuth in np.linspace(0.1, 2.0 * np.pi, 16):
+        light = np.array([np.cos(azimuth), np.sin(azimuth), 1.0])
+        walls = build_room(Room(size_m=Range(6.0, 6.0)), light, RNG(7))
+        (pane,) = (part for part in walls.shape.parts if part.name == "window")
+        middle = pane.vertices.mean(axis=0)[:2]
+        assert middle @ light[:2] / np.linalg.norm(middle) > 0.97  # a corner's is 12 degrees aside
     plain = make(Setting(far)).scene.pairs[0].input
     assert plain.region is not None
     things = plain.region > REGION_FLOOR
