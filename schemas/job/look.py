@@ -90,7 +90,7 @@ class Look(Frozen):
 
     recolour: Recolour = "as_made"
     """Colours of built-in objects: as_made (any hue), packaging (red to yellow, deep green, blue, kraft, white, black), or
-    ranges of hue and saturation."""
+    ranges of hue and saturation. A job file that names none has packaging."""
     floor: Surface | None = None
     """Pictures or colours of the floor."""
     table: Surface | None = None

@@ -72,7 +72,8 @@ def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPl
     unasked = set(get_args(ViewTarget)) if not facts.job.targets.views else set()
     unasked |= {"further_views"} if not facts.job.cameras.more and not _is_studio(facts) else set()
     unasked |= {"alpha"} if not _is_studio(facts) else set()
-    unasked |= set() if any(facts.job.look.asks_for(branch) for branch in BRANCHES.values()) else set(BRANCHES)
+    left = {name for name, branch in BRANCHES.items() if not facts.job.look.asks_for(branch)}
+    unasked |= left if left >= BRANCHES.keys() - {"recolour"} else set()
     return _plan({name: why for name, why in reasons.items() if name not in unasked}, forced)
 
 
@@ -301,7 +302,7 @@ def _surroundings(name: str, branch: str) -> Effect:
 
 
 LOOK_EFFECTS: tuple[Effect, ...] = tuple(_surroundings(name, branch) for name, branch in BRANCHES.items())
-"""Surroundings. A receipt names them where the job asks for any."""
+"""Surroundings. A receipt names them where the job asks for any but `recolour`, which is named alone."""
 
 TABLE: tuple[Effect, ...] = (
     *PHYSICS_EFFECTS,
