@@ -292,7 +292,7 @@ class Job(Frozen):
         """`look` without the branches that change colour alone, where no colour is drawn or the tier is flat."""
         if self.render.rgb and self.drawn.tier != "flat":
             return self.look
-        return self.look.model_copy(update={name: Look.model_fields[name].default for name in OF_COLOUR})
+        return self.look.without(*OF_COLOUR)
 
     @property
     def drawn(self) -> Render:

@@ -146,7 +146,7 @@ class Look(Frozen):
     """Light from all around, by a picture. With `lights` it is the rest of the light."""
     recolour: Recolour = "as_made"
     """Colours of built-in objects: as_made (any hue), packaging (red to yellow, deep green, blue, kraft, white, black), or
-    ranges of hue and saturation."""
+    ranges of hue and saturation. A job file that names none has packaging."""
     floor: Surface | None = None
     """Pictures or colours of the floor."""
     table: Surface | None = None
@@ -163,6 +163,14 @@ class Look(Frozen):
     def _switch(cls, value: object) -> object:
         return {} if value is True else None if value is False else value
 
+    def asks_for(self, branch: str) -> bool:
+        """Whether a branch has another value than its default."""
+        return bool(getattr(self, branch) != Look.model_fields[branch].default)
+
+    def without(self, *branches: str) -> "Look":
+        """The look with these of its branches off, whatever their defaults."""
+        return self.model_copy(update={name: OFF.get(name) for name in branches}) if branches else self
+
     @property
     def folders(self) -> dict[str, str]:
         """The folders of pictures, by the key that names them."""
@@ -173,6 +181,9 @@ class Look(Frozen):
         }
         return {key: folder for key, folder in named.items() if folder}
 
+
+OFF = {"recolour": "as_made"}
+"""The value of a branch that is off; None of any other."""
 
 OF_COLOUR = ("recolour", "floor", "table", "background", "lights", "environment")
 """Branches of the look that change colour alone."""

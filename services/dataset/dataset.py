@@ -308,14 +308,19 @@ def make_scene(
 
 def _parse(job: str | Path | Mapping[str, Any] | Job, changes: Sequence[str]) -> tuple[Job, Path]:
     """The job, and the folder that its relative paths start from."""
-    from services.job.job_file import change_key, load_job, validate_job  # what opens a dataset needs none of it
+    from services.job.job_file import (  # what opens a dataset needs none of it
+        change_key,
+        load_job,
+        validate_job,
+        with_usual_colours,
+    )
 
     if isinstance(job, str | Path):
         return load_job(Path(job), changes), Path(job).parent
     tree = job.model_dump(mode="json") if isinstance(job, Job) else copy.deepcopy(dict(job))
     for change in changes:
         change_key(tree, change)
-    return validate_job(tree, "the job"), Path()
+    return validate_job(with_usual_colours(tree), "the job"), Path()
 
 
 class _MadeFiles:

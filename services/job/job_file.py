@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from schemas.base import VALUE_KINDS, set_key
+from schemas.base import VALUE_KINDS, set_key, with_defaults
 from schemas.dataset.layout import SWITCHES, is_stored
 from schemas.errors import JobError, did_you_mean, plain_line
 from schemas.job.assets import SOURCE_KINDS
@@ -122,11 +122,25 @@ def _written(place: Sequence[str | int]) -> list[str | int]:
 def load_job(path: Path, changes: Sequence[str] = ()) -> Job:
     """Read a job file, or a packed one, and apply `path.to.key=value` changes. Raises JobError."""
     name = name_of(path)
-    job = validate_job(read_tree(path, changes), name)
+    job = validate_job(with_usual_colours(read_tree(path, changes)), name)
     _check_homes(job, name)
     if is_packed(str(path)):
         _check_absolute(job, name)
     return job
+
+
+def with_usual_colours(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys of a new job, whose built-in objects have the colours of packaging unless it says otherwise.
+
+    The record of a job made before there was `look.recolour` has no such key, and its objects are as they were made.
+    """
+    branch = tree.get("assets")
+    sources = (
+        branch.get("objects", [{"source": "procedural"}]) if isinstance(branch, Mapping) else [{"source": "procedural"}]
+    )
+    listed = [source for source in sources if isinstance(source, Mapping)] if isinstance(sources, list) else []
+    built_in = any(source.get("source") == "procedural" for source in listed)
+    return with_defaults(tree, {"look.recolour": "packaging"} if built_in else {})
 
 
 def pack_job(path: Path) -> str:

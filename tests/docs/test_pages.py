@@ -38,7 +38,7 @@ from workers.capture.simulate.simulate import simulate_capture
 from workers.scene.chance import SceneChance
 
 ROOT = Path(__file__).resolve().parents[2]
-DIGEST = "2eb89837f52c05a7ee1aba49a460050c4b61ae4518b068e70c1119ebc72705b2"
+DIGEST = "242487cbd017d6a1657b487f84477dd91e05013f5655de113bf955d02160b5e8"
 FIRST = "./verso run deploy/jobs/tabletop.yaml"
 
 ELSEWHERE = {

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-from schemas.job.look import Look
+from schemas.job.look import OFF
 from schemas.job.views import ViewTarget
 from tests.effects.scenes import (
     ABOVE_THE_HORIZON,
@@ -49,8 +49,12 @@ def _target(name: str) -> Case:
 def _look(name: str, branch: str, value: Any) -> Case:
     """Asked for; not where another branch is asked for."""
     other = {"floor": {"colours": [RED]}} if branch != "floor" else {"table": {"colours": [RED]}}
-    usual = Look.model_fields[branch].default or "off"
-    return _asked({**BEHIND.get(name, {}), "look": {branch: value}}, {"look": other}, f"look.{branch} is {usual}")
+    usual = OFF.get(branch, "off")
+    return _asked(
+        {**BEHIND.get(name, {}), "look": {branch: value}},
+        {"look": {"recolour": "as_made", **other}},
+        f"look.{branch} is {usual}",
+    )
 
 
 RED, BLUE = (0.8, 0.1, 0.1), (0.1, 0.1, 0.8)

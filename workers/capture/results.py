@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from schemas.capture import CaptureListing, Reconstruction
 from schemas.errors import AssetSourceError, CaptureError, InputError, command_line
 from schemas.job.job import Job
-from schemas.job.look import RECOLOUR_VERSION
+from schemas.job.look import OFF, RECOLOUR_VERSION
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
 from workers.assets.environment import open_maps
 from workers.assets.poses import open_poses
@@ -183,7 +183,7 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
     around = job.look.environment  # also of tier flat: a study compares it with the path-traced tier
     maps = () if around is None else open_maps(around.folder, job_folder)
     further += [f"{source.name} {source.sha256}" for source in maps]
-    if look.recolour != "as_made":
+    if look.recolour != OFF["recolour"]:
         further.append(f"recolour {look.model_dump_json(include={'recolour'})} {RECOLOUR_VERSION}")
     if further:
         whole = "\n".join([catalogue.digest, *further])

@@ -16,7 +16,7 @@ from schemas.base import Array
 from schemas.dataset.layout import SWITCHES, PixelKind, is_stored
 from schemas.job.captures import Simulate
 from schemas.job.job import Check, Job
-from schemas.job.look import OF_COLOUR, Look
+from schemas.job.look import OF_COLOUR, OFF
 from schemas.job.views import SensorEffects, Tier, ViewTarget
 from schemas.scene.scene import EffectKind, EffectPlan, ScenePlan
 from schemas.scene.shape import Part
@@ -73,7 +73,8 @@ def plan_effects(facts: Facts, forced: frozenset[str] = frozenset()) -> EffectPl
     unasked |= {"further_views"} if not facts.job.cameras.more and not _is_studio(facts) else set()
     unasked |= {"alpha"} if not _is_studio(facts) else set()
     unasked |= {"kept_poses"} if facts.job.scenes_from is None else set()
-    unasked |= set(BRANCHES) if all(_is_usual(facts, name) for name in BRANCHES) else set()
+    left = {name for name, branch in BRANCHES.items() if not facts.job.look.asks_for(branch)}
+    unasked |= left if left >= BRANCHES.keys() - {"recolour"} else set()
     return _plan({name: why for name, why in reasons.items() if name not in unasked}, forced)
 
 
@@ -166,15 +167,11 @@ def _tier(*tiers: Tier) -> Reason:
     return _first_of(_stored("rgb"), skipped_because)
 
 
-def _is_usual(facts: Facts, name: str) -> bool:
-    """Whether the job leaves a branch of `look` as it is unless asked for."""
-    return bool(getattr(facts.job.look, BRANCHES[name]) == Look.model_fields[BRANCHES[name]].default)
-
-
 def _look(name: str) -> Reason:
-    """A branch of `look`, which runs in every scene where the job asks for it."""
-    usual = Look.model_fields[BRANCHES[name]].default or "off"
-    return _where(lambda facts: not _is_usual(facts, name), f"look.{BRANCHES[name]} is {usual}")
+    """A branch of `look`, which runs in every scene where it is not off."""
+    branch = BRANCHES[name]
+    off = OFF.get(branch)
+    return _where(lambda facts: getattr(facts.job.look, branch) != off, f"look.{branch} is {off or 'off'}")
 
 
 BRANCHES = {
@@ -316,7 +313,7 @@ def _surroundings(name: str, branch: str) -> Effect:
 
 
 LOOK_EFFECTS: tuple[Effect, ...] = tuple(_surroundings(name, branch) for name, branch in BRANCHES.items())
-"""Surroundings. A receipt names them where the job asks for any."""
+"""Surroundings. A receipt names them where the job asks for any but `recolour`, which is named alone."""
 
 TABLE: tuple[Effect, ...] = (
     *PHYSICS_EFFECTS,

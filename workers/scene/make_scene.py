@@ -15,12 +15,12 @@ from workers.physics.settle import Rest, keep_scene, recheck_scene, settle_scene
 from workers.scene.cameras import frame_cameras, place_more, require_aimed
 from workers.scene.chance import SceneChance
 from workers.scene.context import WorkerContext
-from workers.scene.effects import Facts, is_raycast_scene, plan_effects
+from workers.scene.effects import BRANCHES, Facts, is_raycast_scene, plan_effects
 from workers.scene.pairs import SettledScene, make_further, make_pair
 from workers.scene.plan import plan_scene, pouring_of
 from workers.scene.ray_check import check_pair
 from workers.scene.studio import stand_alone
-from workers.scene.surround import look_without, surround
+from workers.scene.surround import surround
 from workers.stopwatch import Stopwatch
 
 
@@ -72,7 +72,7 @@ def make_scene(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> S
 def plan_with_effects(context: WorkerContext, scene_id: int, stopwatch: Stopwatch) -> tuple[ScenePlan, EffectPlan]:
     """What chance decides, and the effects that it calls for. Raises SceneError."""
     job, chance = context.job, SceneChance(context.job.seed, scene_id)
-    look = look_without(job.drawn_look, context.withdrawn)
+    look = job.drawn_look.without(*(branch for name, branch in BRANCHES.items() if name in context.withdrawn))
     with stopwatch.stage("assets"):
         catalogue = replace(context.catalogue, recolour=look.recolour)
         plan = plan_scene(job, catalogue, chance)

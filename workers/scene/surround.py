@@ -1,7 +1,7 @@
 """What `look` puts around the objects of a scene that is planned, from streams of its own, so that nothing else moves."""
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 from schemas.job.job import Job
@@ -14,7 +14,6 @@ from workers.assets.lights import describe_lights, draw_environment, draw_lights
 from workers.assets.pictures import load_picture
 from workers.assets.surroundings import Coat, build_room, cover_floor, cover_table, draw_coat, require_table_inside
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.effects import BRANCHES
 from workers.scene.plan import add_clutter
 
 FLOOR, TABLE, BACKGROUND, ROOM = range(4)
@@ -22,12 +21,6 @@ FLOOR, TABLE, BACKGROUND, ROOM = range(4)
 
 ROUGH, SMOOTH = 0.9, 0.8
 """Roughness of a floor's cover and of a table's: neither has highlights."""
-
-
-def look_without(look: Look, names: Collection[str]) -> Look:
-    """The look without the effects of these names."""
-    off = {branch: Look.model_fields[branch].default for name, branch in BRANCHES.items() if name in names}
-    return look.model_copy(update=off) if off else look
 
 
 def surround(job: Job, look: Look, catalogue: Catalogue, chance: SceneChance, plan: ScenePlan) -> ScenePlan:

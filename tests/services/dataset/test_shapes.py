@@ -17,7 +17,7 @@ from tests.services.conftest import TWO_PAIRS
 from tests.workers.assets.libraries import library_of
 from workers.store.local import LocalStore
 
-KEYS = overlaid(SMALL, TWO_PAIRS)
+KEYS = overlaid(SMALL, TWO_PAIRS) | {"look": {"recolour": "as_made"}}
 
 
 def test_a_mesh_is_the_same_in_every_form_and_may_be_changed(dataset, files):

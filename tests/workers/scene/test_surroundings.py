@@ -16,7 +16,8 @@ from schemas.job.job import job_digest
 from schemas.job.look import Palette, Room, Surface
 from schemas.scene.shape import REGION_FIRST_CLUTTER, REGION_FIRST_OBJECT, REGION_FLOOR, Part
 from schemas.scene.view import MODALITIES
-from services.job.job_file import validate_job
+from services.job.job_file import load_job, validate_job
+from services.job.record import decode_job, encode_job, record_job
 from tests.effects.cases import ABOVE_THE_HORIZON, PICTURES
 from tests.effects.scenes import Made, Setting, facts_of, make
 from workers.assets.pictures import KEPT_PX, LARGEST_PX, load_picture, open_pictures
@@ -264,3 +265,25 @@ def test_a_room_is_a_switch_and_where_pictures_lie_decides_nothing():
     job, other = (validate_job({"name": "x", "look": {"room": True, "floor": {"folder": name}}}, "x") for name in "ab")
     assert job.look.room == Room() and validate_job({"name": "x", "look": {"room": False}}, "x").look.room is None
     assert job_digest(job, "c") == job_digest(other, "c") != job_digest(validate_job({"name": "x"}, "x"), "c")
+
+
+@pytest.mark.parametrize(
+    ("text", "recolour"),
+    [("", "packaging"), ("look: {room: true}", "packaging"), ("look: {recolour: as_made}", "as_made"),
+     ("assets: {objects: [{source: library, folder: x}, {source: procedural}]}", "packaging"),
+     ("assets: {objects: [{source: library, folder: x}]}", "as_made")],
+)  # fmt: skip
+def test_a_new_job_of_built_in_objects_has_the_colours_of_packaging_and_an_older_record_has_not(
+    tmp_path, text, recolour
+):
+    (tmp_path / "a.yaml").write_text(f"name: x\n{text}\n")
+    job = load_job(tmp_path / "a.yaml")
+    assert job.look.recolour == recolour
+    record = record_job(job, "c", tmp_path)
+    assert decode_job(encode_job(record), "job.yaml").job.look == job.look
+    older = (
+        encode_job(record_job(validate_job({"name": "x"}, "x"), "c", tmp_path))
+        .decode()
+        .replace("recolour: as_made", "")
+    )
+    assert decode_job(older.encode(), "job.yaml").job.look.recolour == "as_made"
