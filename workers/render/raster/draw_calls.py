@@ -254,7 +254,8 @@ def sort_draws(
             continue
         shape, ground = fetch(thing.shape), is_floor(thing)
         split = raster and has_level_top(thing)
-        hides = thing.region_id == REGION_TABLE and not view.cut
+        has_holes = any(batch.holes for batch in shape.batches)
+        hides = thing.region_id == REGION_TABLE and not (view.cut and has_holes)
         T_cam_shape = view.T_cam_world @ thing.T_world_shape
         beyond_near = is_beyond_near(shape, T_cam_shape)
         culls = hides_backs(shape, beyond_near, through_holes=not view.labels)
