@@ -34,6 +34,16 @@ SMALL: dict[str, Any] = {
     "check": {"raycast_share": 0.0, "mirror_agreement_mm": 5.0},
 }
 
+LOOK: dict[str, Any] = {
+    "recolour": "packaging",
+    "room": True,
+    "clutter": {"count": 2},
+    "floor": {"colours": [[0.4, 0.4, 0.4], [0.6, 0.5, 0.4]]},
+    "lights": {},
+    "environment": {"built_in": ["overcast", "window_room"]},
+}
+"""Light and surroundings, drawn for each scene."""
+
 
 def overlaid(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     """A tree of settings merged with changes, branch by branch."""

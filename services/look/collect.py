@@ -67,6 +67,12 @@ class Figures:
     stages: Mapping[str, Cost]
     """The costliest first."""
     failures: Sequence[Failure]
+    drawn: Mapping[str, Counter[str]]
+    """What scenes have of `look`, by what it is and its name; without what no scene has."""
+    room: Mapping[str, Histogram]
+    """Metres, by side."""
+    elevation: Histogram
+    """Of the light that casts shadows, degrees above the horizontal."""
 
     @property
     def scenes(self) -> int:
@@ -101,7 +107,10 @@ def collect(tables: StoredTables) -> Figures:
             return answer(sql).read_all().to_pylist()
 
         def histograms(column: str, low: float, high: float) -> dict[str, Histogram]:
-            return {role: _histogram(answer, column, role, Histogram(low, high)) for role in ("input", "mirror")}
+            return {role: of_views(role, column, low, high) for role in ("input", "mirror")}
+
+        def of_views(role: str, column: str, low: float, high: float) -> Histogram:
+            return _histogram(answer, column, f"views where role = '{role}'", Histogram(low, high))
 
         by_category = rows("select category, count(*) as scenes from scenes group by 1 order by 1")
         effects, stages = _read_costs(rows)
@@ -113,10 +122,13 @@ def collect(tables: StoredTables) -> Figures:
             **rows("select coalesce(sum(total_s), 0.0) as seconds from timings")[0],
             visibility=histograms("visible_fraction", 0.0, 1.0),
             inclination=histograms("degrees(inclination_rad)", -96.0, 96.0),
-            distance=_histogram(answer, "d_z_m", "input", Histogram(*DEPTH_M)),
+            distance=of_views("input", "d_z_m", *DEPTH_M),
             effects=dict(sorted(effects.items(), key=lambda item: (-item[1].seconds, -item[1].runs, item[0]))),
             stages=dict(sorted(stages.items(), key=lambda item: -item[1].seconds)),
             failures=[Failure(**row) for row in rows(_FAILURES)],
+            drawn={name: counts for name, sql in DRAWN.items() if (counts := _count_drawn(rows, sql))},
+            room={side: _histogram(answer, sql, "scenes", Histogram(*ROOM_M)) for side, sql in _SIDES.items()},
+            elevation=_histogram(answer, _ELEVATION, "scenes", Histogram(-96.0, 96.0)),
         )
 
 
@@ -124,9 +136,45 @@ _OBJECTS = "category not in ('table', 'board')"
 """Of assets; what they stand on is not counted."""
 
 
-def _histogram(answer: Question, column: str, role: str, histogram: Histogram) -> Histogram:
-    """The histogram with a column of the views of a role, batch by batch."""
-    for batch in answer(f"select {column}::double as value from views where role = '{role}' and value is not null"):
+DRAWN = {
+    "Environment": "surroundings.environment",
+    "Lights": "len(surroundings.lights)",
+    "Floor": "surroundings.floor",
+    "Table": "surroundings.table",
+    "Background": "surroundings.background",
+    "Clutter objects": "len(surroundings.clutter)",
+}
+"""What is drawn of `look` and has a name or a number, by heading, in SQL."""
+
+ROOM_M = (0.0, 60.0)
+"""Range of counted sides of rooms, metres: that of `look.room`."""
+
+_SIDES = {side: f"surroundings.room_m[{at}]" for at, side in enumerate(("length", "width"), 1)}
+_KEY = "surroundings.lights[1].towards"
+_ELEVATION = f"degrees(atan2({_KEY}[3], sqrt({_KEY}[1] ** 2 + {_KEY}[2] ** 2)))"
+
+MOST_LOOKS = 12
+_LOOKS = f"""
+select scene_id from scenes where surroundings is not null
+order by row_number() over (partition by {", ".join(DRAWN.values())} order by scene_id), scene_id limit {MOST_LOOKS}
+"""
+
+
+def choose_looks(tables: StoredTables) -> list[int]:
+    """At most `MOST_LOOKS` scenes with surroundings: first those in which something else was drawn than in each before."""
+    ids: list[int] = query(tables, _LOOKS)["scene_id"].to_pylist()
+    return ids
+
+
+def _count_drawn(rows: Callable[[str], list[dict[str, Any]]], sql: str) -> Counter[str]:
+    """Scenes by what was drawn, in its order."""
+    counted = rows(f"select {sql} as name, count(*) as scenes from scenes where name is not null group by 1 order by 1")
+    return Counter({str(row["name"]): row["scenes"] for row in counted})
+
+
+def _histogram(answer: Question, column: str, source: str, histogram: Histogram) -> Histogram:
+    """The histogram with a column of rows, batch by batch."""
+    for batch in answer(f"select value from (select {column}::double as value from {source}) where value is not null"):
         histogram = histogram.add(batch.column("value"))
     return histogram
 

@@ -231,13 +231,15 @@ def choose_scenes(tables: StoredTables, scenes: int) -> list[int]:
     return [ids[place] for ids in by_category for place in spread_evenly(len(ids), each)]
 
 
-def show_scenes(store: Store, scene_ids: Iterable[int]) -> tuple[list[ShownScene], Mapping[str, Histogram]]:
-    """The pictures of these scenes, and the depth of their object pixels by role, metres.
+def show_scenes(
+    store: Store, scene_ids: Iterable[int], kinds: Collection[PixelKind] | None = None
+) -> tuple[list[ShownScene], Mapping[str, Histogram]]:
+    """The pictures of these scenes, of these modalities or of all, and the depth of their object pixels by role, metres.
 
     Raises CorruptError where an image is missing or damaged.
     """
     dataset, depth = Dataset(store), {role: Histogram(*DEPTH_M) for role in SHOWN_ROLES}
-    return [show_pair(pairs[0], depth) for scene_id in scene_ids if (pairs := dataset.scene(scene_id))], depth
+    return [show_pair(pairs[0], depth, kinds) for scene_id in scene_ids if (pairs := dataset.scene(scene_id))], depth
 
 
 def show_pair(pair: Pair, depth: dict[str, Histogram], kinds: Collection[PixelKind] | None = None) -> ShownScene:

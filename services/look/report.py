@@ -15,17 +15,18 @@ from schemas.errors import MachineError, OutputError, command_line, plural
 from services.job.record import JobRecord, read_success, require_job
 from services.look.charts import Histogram
 from services.look.clouds import Space, pack_spaces, read_spaces
-from services.look.collect import MOST_RANGES, Figures, SceneTable, collect, read_scene_table
+from services.look.collect import MOST_RANGES, Figures, SceneTable, choose_looks, collect, read_scene_table
 from services.look.pictures import ShownScene, choose_scenes, show_scenes
 from services.look.sections import (
     charts_html,
     effects_html,
     failures_html,
+    look_html,
     overview_html,
     scene_table_html,
     space_html,
 )
-from services.look.sheets import Address, compare_html, sheets_html
+from services.look.sheets import Address, compare_html, sheets_html, strip_html
 from services.read.dataset_reader import StoredTables
 from workers.store.store import Store
 
@@ -159,6 +160,8 @@ class Report:
     """Of the object pixels in these scenes, by role, metres."""
     spaces: tuple[Space, ...]
     table: SceneTable
+    looks: list[ShownScene]
+    """Scenes with different looks, in colour."""
     place: str
     """Of the dataset."""
 
@@ -174,7 +177,9 @@ def read_report(store: Store, scenes: int) -> Report:
     spaces = read_spaces(store, [scene.scene_id for scene in shown])
     figures = collect(tables)
     table = read_scene_table(tables, record.job.assets.split, figures.scenes)
-    return Report(record, (read_success(store) or {}).get("digest"), figures, shown, depth, spaces, table, store.name)
+    looks, _ = show_scenes(store, choose_looks(tables), ("rgb",))
+    digest = (read_success(store) or {}).get("digest")
+    return Report(record, digest, figures, shown, depth, spaces, table, looks, store.name)
 
 
 def page_of(report: Report, address: Address) -> Page:
@@ -190,6 +195,7 @@ def page_of(report: Report, address: Address) -> Page:
         Section("compare", "Compare", compare_html(scenes)),
         Section("space", "In space", space_html(report.spaces, pack_spaces(report.spaces))),
         Section("figures", "Figures", charts_html(figures, report.depth)),
+        Section("look", "Look", look_html(figures, [strip_html(one, address) for one in report.looks if one.pictures])),
         Section("effects", "Effects", effects_html(figures)),
         Section("failures", "Failures", failures_html(figures.failures, figures.scenes + failed)),
     )

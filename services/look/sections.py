@@ -62,24 +62,57 @@ def overview_html(
         f"<div><dt>{escape(name)}</dt><dd>{escape(value)}<small>{escape(more)}</small></dd></div>"
         for name, value, more in tiles
     )
-    most = max(figures.by_category.values(), default=1)
-    frame = 'class="share" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true"'
     shown = (
         [name for name in SPLITS if name != "unseen" or any(count[name] for count in splits.values())] if splits else []
     )
-    head = "".join(f'<th scope="col">{name}</th>' for name in ("", "", "all", *shown)) if shown else ""
+    by_split = ", and by their splits in exports" if shown else ""
+    parts = {split: {name: count[split] for name, count in splits.items()} for split in shown} if splits else {}
+    table = bars_html(f"Scenes by category{by_split}", figures.by_category, parts)
+    sampled = "The dataset is not finished and large: the figures are of ranges chosen evenly from it."
+    note = f'<p class="note">{sampled}</p>' if figures.sampled else ""
+    return f'<dl class="tiles">{tiles_html}</dl>{table}{note}'
+
+
+def bars_html(caption: str, counts: Mapping[str, int], parts: Mapping[str, Mapping[str, int]]) -> str:
+    """A table of counts by name, with bars, and of parts of each count by heading. Empty without counts."""
+    if not counts:
+        return ""
+    most = max(counts.values())
+    frame = 'class="share" viewBox="0 0 100 8" preserveAspectRatio="none" aria-hidden="true"'
     rows = "".join(
         f'<tr><th scope="row">{escape(name)}</th><td class="wide"><svg {frame}><rect class="bar" '
         f'width="{100 * count / most:.1f}" height="8"/></svg></td><td>{count:,}</td>'
-        f"{''.join(f'<td>{splits[name][split]:,}</td>' for split in shown) if splits else ''}</tr>"
-        for name, count in figures.by_category.items()
+        f"{''.join(f'<td>{part[name]:,}</td>' for part in parts.values())}</tr>"
+        for name, count in counts.items()
     )
-    by_split = ", and by their splits in exports" if shown else ""
-    head = f"<thead><tr>{head}</tr></thead>" if head else ""
-    table = f'<table class="bars"><caption>Scenes by category{by_split}</caption>{head}<tbody>{rows}</tbody></table>'
-    sampled = "The dataset is not finished and large: the figures are of ranges chosen evenly from it."
-    note = f'<p class="note">{sampled}</p>' if figures.sampled else ""
-    return f'<dl class="tiles">{tiles_html}</dl>{table if rows else ""}{note}'
+    heads = "".join(f'<th scope="col">{name}</th>' for name in ("", "", "all", *parts))
+    head = f"<thead><tr>{heads}</tr></thead>" if parts else ""
+    return f'<table class="bars"><caption>{escape(caption)}</caption>{head}<tbody>{rows}</tbody></table>'
+
+
+MOST_NAMES = 12
+"""Of a thing that is drawn, those drawn most often."""
+
+
+def look_html(figures: Figures, strips: Sequence[str]) -> str:
+    """What was drawn of `look`, with scenes to look at. Empty where no scene has any of it."""
+    metres, degrees = partial(amount, unit="m"), partial(amount, unit="°")
+    charts = (
+        Chart("Room", figures.room, "Inside, of each scene that has one.", metres),
+        Chart("Elevation of the light", {"": figures.elevation}, "Of the one that casts shadows.", degrees),
+    )
+    tables = "".join(
+        bars_html(
+            f"{name}{f', the {MOST_NAMES} most frequent of {len(counts):,}' if len(counts) > MOST_NAMES else ''}",
+            counts if len(counts) <= MOST_NAMES else dict(counts.most_common(MOST_NAMES)),
+            {},
+        )
+        for name, counts in figures.drawn.items()
+    )
+    shown = "".join(map(chart_html, charts))
+    columns = "".join(f"<div{kind}>{part}</div>" for kind, part in (("", tables), (' class="charts"', shown)) if part)
+    sheet = f'<div class="latest">{"".join(strips)}</div>' if strips else ""
+    return f'<div class="charts">{columns}</div>{sheet}' if columns else ""
 
 
 def charts_html(figures: Figures, depth: Mapping[str, Histogram]) -> str:

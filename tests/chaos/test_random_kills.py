@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.datasets import LOOK
 from tests.kit.killed_runs import marked, processes_with
 
 pytestmark = pytest.mark.ray
@@ -32,6 +33,7 @@ images: {patch: {width: 32, height: 24}}
 check: {raycast_share: 0.1, mirror_agreement_mm: 5.0}
 run: {range_size: 2, shard_size: 4}
 """
+JOB += f"look: {json.dumps(LOOK)}\n"
 
 
 @dataclass

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.datasets import SMALL
+from tests.datasets import LOOK, SMALL
 
 ROOT = Path(__file__).resolve().parents[2]
 HOSTS = ROOT.parent / "shared" / "tools" / "hosts"
@@ -234,12 +234,18 @@ def test_a_killed_head_that_is_brought_back_and_asked_again_makes_the_same_datas
     assert digest_in(lose_the_head(cluster, packed, cluster.storage / "headless")) == local
 
 
-def test_rings_in_a_studio_are_the_same_where_hosts_are_lost_and_where_a_job_is_extended(cluster, folder):
-    more = [{"name": "around", "ring": {"count": 3, "radius_m": [1.0, 2.0]}}, {"name": "side", "beside": "input"}]
-    tree = {**SMALL, "scene": "studio", "cameras": {**SMALL["cameras"], "more": more}, "run": {"range_size": 2}}
-    file = folder / "studio.yaml"
+MORE = [{"name": "around", "ring": {"count": 3, "radius_m": [1.0, 2.0]}}, {"name": "side", "beside": "input"}]
+CHANGES = {
+    "rings": {"scene": "studio", "cameras": {**SMALL["cameras"], "more": MORE}},
+    "look": {"look": LOOK},
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_job_is_the_same_where_hosts_are_lost_and_where_it_is_extended(cluster, folder, name):
+    file = folder / f"{name}.yaml"
     for scenes in (20, 48):
-        file.write_text(json.dumps({**tree, "scenes": scenes}))
-        extended = run_here(file, folder / "extended")
+        file.write_text(json.dumps({**SMALL, **CHANGES[name], "run": {"range_size": 2}, "scenes": scenes}))
+        extended = run_here(file, folder / f"{name}_extended")
     packed = here("pack", str(file)).strip()
-    assert digest_in(lose_two_hosts(cluster, packed, cluster.storage / "studio")) == extended
+    assert digest_in(lose_two_hosts(cluster, packed, cluster.storage / name)) == extended

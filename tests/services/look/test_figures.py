@@ -19,11 +19,12 @@ from services.look.collect import (
     Cost,
     Failure,
     SceneTable,
+    choose_looks,
     collect,
     read_scene_table,
     worst_first,
 )
-from services.look.sections import charts_html, effects_html, failures_html, overview_html, scene_table_html
+from services.look.sections import charts_html, effects_html, failures_html, look_html, overview_html, scene_table_html
 from services.read.dataset_reader import StoredTables
 from services.read.query import query
 from tests.made_up_scenes import attempt_at
@@ -179,6 +180,37 @@ def test_sections_say_what_was_asked_made_left_out_and_failed(figures):
     html = charts_html(figures, {"input": Histogram(0.0, 9.6)})
     titles = ["Distance to the object", "Visibility", "Inclination"]  # no depth: it has no values
     assert re.findall("<h3>(.*?)</h3>", html) == titles
+
+
+def test_what_was_drawn_of_the_look_is_counted_and_shown_and_without_a_look_there_is_nothing(figures):
+    light = [{"towards": [0.6, 0.0, 0.8]}, {"towards": [0.0, 0.0, 1.0]}]
+    drawn = [
+        {"environment": "office", "floor": HOSTILE, "lights": light, "clutter": [{}] * 2, "room_m": [6.0, 7.0, 3.0]},
+        {"environment": "office", "floor": HOSTILE, "room_m": [8.0, 7.0, 3.0]},
+        None,
+        {"environment": "overcast", "lights": light[1:], "clutter": []},
+        {"environment": "office", "floor": HOSTILE},
+    ]
+    tables = Handmade(scenes=[{"scene_id": 9 - at, "surroundings": one} for at, one in enumerate(drawn)])
+    made = collect(tables)
+    assert made.drawn == {
+        "Environment": {"office": 3, "overcast": 1},
+        "Lights": {"1": 1, "2": 1},
+        "Floor": {HOSTILE: 3},
+        "Clutter objects": {"0": 1, "2": 1},
+    }
+    assert (made.room["length"].least, made.room["length"].most, made.room["width"].count) == (6.0, 8.0, 2)
+    assert (made.elevation.least, made.elevation.most) == pytest.approx((np.degrees(np.arcsin(0.8)), 90.0))
+    assert choose_looks(tables) == [5, 6, 9, 8]  # 5 and 8 were drawn alike
+    html = look_html(made, ["<figure>a scene</figure>"])
+    assert (
+        "<script" not in html and "&lt;script&gt;" in html and html.endswith('"latest"><figure>a scene</figure></div>')
+    )
+    assert re.findall(r'<rect class="bar" width="([\d.]+)" height="8"', html)[:2] == ["100.0", "33.3"]
+    many = replace(made, drawn={"Floor": Counter({f"{at}.png": 1 + (at == 20) for at in range(30)})})
+    html = look_html(many, [])
+    assert "Floor, the 12 most frequent of 30" in html and html.count("<tr>") == 12 and "20.png</th>" in html
+    assert look_html(figures, []) == "" and choose_looks(Handmade(scenes=[{"scene_id": 1}])) == []
 
 
 def test_what_comes_from_the_dataset_is_text_and_never_markup(figures):
