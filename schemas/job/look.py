@@ -79,7 +79,7 @@ class Surface(Frozen):
 
     folder: Folder | None = None
     """A folder of .jpg and .png pictures, with the folders in it, relative to the job file."""
-    tile_m: Annotated[Interval, _within(0.01, 100.0)] = Range(1.0, 1.0)
+    tile_m: Annotated[OneOrRange, _within(0.01, 100.0)] = Range(1.0, 1.0)
     """Metres after which a picture repeats along its width; its height follows."""
     colours: Annotated[tuple[Rgb, ...], Field(max_length=1000)] = ()
     """sRGB colours instead of pictures, each number from 0 to 1."""
@@ -94,9 +94,9 @@ class Surface(Frozen):
 class Room(Frozen):
     """Four walls, without a ceiling, about the middle of the table, with a skirting and a window on the key light's side."""
 
-    size_m: Annotated[Interval, _within(1.0, 59.0)] = Range(5.5, 8.0)
+    size_m: Annotated[OneOrRange, _within(1.0, 59.0)] = Range(5.5, 8.0)
     """Length and width inside, each drawn by itself."""
-    height_m: Annotated[Interval, _within(0.5, 20.0)] = Range(2.6, 3.2)
+    height_m: Annotated[OneOrRange, _within(0.5, 20.0)] = Range(2.6, 3.2)
     """Height of the walls."""
 
 

@@ -198,6 +198,9 @@ def checkout_at(root: Path) -> Path:
     predictions = root / "predictions" / "depth"
     predictions.mkdir(parents=True)
     cv2.imwrite(str(predictions / "00001.png"), np.full((480, 640), 5 * 1300, np.uint16))
+    for number, name in enumerate(("table", "floor")):
+        (root / "photos" / name).mkdir(parents=True)
+        cv2.imwrite(str(root / "photos" / name / "a.jpg"), np.full((90, 120, 3), 90 + 60 * number, np.uint8))
     (root / "shared").mkdir()  # what hosts see under one name
     return root
 

@@ -531,26 +531,24 @@ def test_forces_of_a_scene_in_balance_have_no_fault_and_each_wrong_one_is_told()
         (lambda low, high: low["contacts"][0].update(normal=[0.0, 0.0, 1.001]), "has not the length 1"),
     ):
         assert told in faults(edit)
-    given = {"box": 2.0, "mug": 0.25}  # the table has 0.7: on it the box has 1.4, under the mug 0.5
+    given = {"box": 2.0, "mug": 0.25}  # 0.5 between them
 
-    def leaning(box: float | None, mug: float | None, most: float, pushed: int, job: Any = given) -> str:
-        """The mug pushed aside by 0.4 of what presses it, or the box by `most` less a thousandth, both ways."""
+    def pushed(box: float | None, mug: float | None, share: float, job: Any = given) -> str:
+        """The mug pushed both ways by this share of what presses it."""
 
         def edit(low, high):
             low["friction"], high["friction"] = box, mug
-            for k, sign in ((0, 1), (1, -1)):
-                first = (low if pushed == 3 else high)["contacts"]
-                first[k]["force"][0] = sign * (most - 1e-3) * first[k]["force"][2]
-                if pushed == 4:
-                    low["contacts"][k + 2]["force"][0] = -first[k]["force"][0]
+            for k, sign in ((0, share), (1, -share)):
+                high["contacts"][k]["force"][0] = sign * HIGH / 2
+                low["contacts"][k + 2]["force"][0] = -sign * HIGH / 2
 
         return faults(edit, {"physics": {"friction": job, "exact_rest": True}, "captures": None})
 
-    assert leaning(2.0, 0.25, 1.4, 3) == leaning(2.0, 0.25, 0.5, 4) == ""
-    assert "region 3: a contact needs more than its friction of 1.4" in leaning(2.0, 0.25, 1.402, 3)
-    assert "region 4: a contact needs more than its friction of 0.48" in leaning(2.0, 0.24, 0.5, 4)
-    assert "region 4: its friction is 0.24, and physics.friction gives 0.25" in leaning(2.0, 0.24, 0.4, 4)
-    assert "region 3: its friction is None, and physics.friction gives 2" in leaning(None, 0.25, 0.4, 3)
-    assert "region 3: its friction is 2.0, and physics.friction gives 0.7" in leaning(2.0, None, 0.4, 3, 0.7)
+    assert pushed(2.0, 0.25, 0.499) == ""
+    assert "region 4: a contact needs more than its friction of 0.5" in pushed(2.0, 0.25, 0.501)
+    assert "region 4: a contact needs more than its friction of 0.48" in pushed(2.0, 0.24, 0.499)
+    assert "region 4: its friction is 0.24, and physics.friction gives 0.25" in pushed(2.0, 0.24, 0.4)
+    assert "region 3: its friction is None, and physics.friction gives 2" in pushed(None, 0.25, 0.4)
+    assert "region 3: its friction is 2.0, and physics.friction gives 0.7" in pushed(2.0, None, 0.4, 0.7)
     without_rest = {"physics": {"friction": 0.7, "exact_rest": False}, "captures": None}
     assert faults(nothing_below, without_rest) == faults(nothing_below, {**JOB, "captures": {}}) == ""
