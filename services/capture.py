@@ -159,8 +159,8 @@ def simulate(options: argparse.Namespace) -> int:
     from workers.capture.score import describe_true_grazing
     from workers.capture.simulate.simulate import simulate_capture
     from workers.render.tiers import require_tier
+    from workers.scene.draw.plan import SceneChance
     from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
-    from workers.scene.plan import SceneChance
 
     settings, chance = job.captures.simulate, SceneChance(job.seed, job.first_scene)
     require_tier(Render(tier=settings.tier))

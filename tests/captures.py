@@ -34,8 +34,8 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE, Asset
 from schemas.scene.view import Camera, Intrinsics
 from services.job.job_file import validate_job
 from tests.datasets import overlaid
-from workers.assets.appearance import draw_appearance
 from workers.assets.builtin.make import make_asset
+from workers.assets.look.appearance import draw_appearance
 from workers.capture import make_capture
 from workers.capture.folder import CaptureFile, CaptureFolder, write_description, write_view
 from workers.capture.make_capture import board_asset

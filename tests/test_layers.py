@@ -20,7 +20,7 @@ FORBIDDEN = (
     ("workers.assets.mass", "workers.physics.thing", "stages apart"),
     ("workers.geometry.hull", "workers.physics.thing", "stages apart"),
     ("workers.door.opening", "workers.assets.thing", "stages apart"),
-    ("workers.scene.plan", "workers.shard.thing", "stages apart"),
+    ("workers.scene.draw.plan", "workers.shard.thing", "stages apart"),
     ("workers.geometry.hull", "subprocess", "geometry is pure"),
     ("services.merge.merge", "services.run.thing", "services: commands"),
     ("services.read.query", "services.dataset.thing", "services: commands"),
@@ -49,8 +49,8 @@ ALLOWED = (
     ("workers.scene.pairs", "workers.geometry.thing"),
     ("workers.assets.mass", "workers.door.thing"),
     ("workers.store.local", "schemas.dataset.thing"),
-    ("workers.scene.plan", "workers.physics.thing, workers.assets.thing"),
-    ("workers.shard.run_shard", "workers.scene.plan, workers.render.raster.gbuffer, workers.store.local"),
+    ("workers.scene.draw.plan", "workers.physics.thing, workers.assets.thing"),
+    ("workers.shard.run_shard", "workers.scene.draw.plan, workers.render.raster.gbuffer, workers.store.local"),
 )
 
 

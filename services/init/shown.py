@@ -15,9 +15,9 @@ from schemas.job.views import Render
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, Asset, Material, Part, Shape
 from schemas.scene.view import Camera, Intrinsics
-from workers.assets.appearance import draw_appearance
 from workers.assets.library.guess import ON_TABLE_M, length
 from workers.assets.library.table import Row
+from workers.assets.look.appearance import draw_appearance
 from workers.door.meshes.mesh import transform_shape
 from workers.geometry.frames import pose, translation
 from workers.render.raster.gbuffer import Renderer

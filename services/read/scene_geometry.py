@@ -49,8 +49,8 @@ class Sources:
         with needs_making(missing):
             from workers.assets.catalogue import load_asset
             from workers.scene.chance import SceneChance
-            from workers.scene.plan import choose_assets
-            from workers.scene.studio import scaled_to
+            from workers.scene.draw.plan import choose_assets
+            from workers.scene.draw.studio import scaled_to
         try:
             catalogue = self.catalogue
         except InputError as error:
@@ -156,9 +156,9 @@ def pose_shapes(store: Store, stored: StoredRange, row: Row, record: JobRecord, 
 def _floor(record: JobRecord, sources: Sources, scene_id: int) -> list[Named]:
     try:
         with needs_making("the floor"):
-            from workers.assets.appearance import draw_appearance
+            from workers.assets.look.appearance import draw_appearance
             from workers.scene.chance import SceneChance, Stream
-            from workers.scene.surround import lay_floor
+            from workers.scene.draw.surround import lay_floor
     except MachineError:
         return []
     chance, look = SceneChance(record.job.seed, scene_id), record.job.drawn_look

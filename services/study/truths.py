@@ -22,7 +22,7 @@ from schemas.job.views import Render
 from schemas.scene.scene import Ground, Placed
 from schemas.scene.shape import REGION_FLOOR, is_object
 from schemas.scene.view import Camera, Intrinsics
-from workers.assets.appearance import draw_appearance
+from workers.assets.look.appearance import draw_appearance
 from workers.geometry.camera import NEAR_M, project, project_bounds, unproject
 from workers.geometry.frames import invert, transform
 from workers.geometry.raycast import first_hit
@@ -30,9 +30,9 @@ from workers.render.pathtraced import draw_view
 from workers.render.tiers import require_tier
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.context import WorkerContext
+from workers.scene.draw.surround import light_scene
 from workers.scene.effects import Facts, plan_effects
 from workers.scene.make_scene import Scene
-from workers.scene.surround import light_scene
 
 Box = tuple[float, float, float, float]
 """(left, top, right, bottom)."""

@@ -22,11 +22,11 @@ from workers.capture.results import open_sources
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.chance import SceneChance
 from workers.scene.context import WorkerContext
+from workers.scene.draw.plan import plan_scene
+from workers.scene.draw.surround import surround
 from workers.scene.effects import Facts, is_raycast_scene
 from workers.scene.make_scene import Scene, make_scene
-from workers.scene.plan import plan_scene
 from workers.scene.rows import record_scene
-from workers.scene.surround import surround
 from workers.stopwatch import Stopwatch
 
 SMALL: dict[str, Any] = {

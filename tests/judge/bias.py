@@ -25,7 +25,7 @@ from workers.physics.effects import called_for
 from workers.physics.pour import NOTHING_MORE
 from workers.physics.settle import settle_scene
 from workers.scene.chance import SceneChance
-from workers.scene.plan import plan_scene, pouring_of
+from workers.scene.draw.plan import plan_scene, pouring_of
 
 FALL_S, STEP_S = 2.5, 1e-3
 """What MuJoCo has to bring a scene to rest, and its step; what still rolls by then counts where it is."""

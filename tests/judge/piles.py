@@ -21,7 +21,7 @@ from tests.judge.scenes import CRASHED, Asked, Outcome, try_scene
 from tests.judge.table import describe, is_within, summary, tabulate
 from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.scene.chance import SceneChance
-from workers.scene.plan import plan_scene, pouring_of
+from workers.scene.draw.plan import plan_scene, pouring_of
 
 
 @functools.cache

@@ -28,8 +28,8 @@ from workers.physics.fall import FINEST
 from workers.physics.hold import RELEASE_RATE, moved_by, release_again
 from workers.physics.settle import RECHECK_S, settle_scene
 from workers.scene.chance import SceneChance
+from workers.scene.draw.plan import plan_scene
 from workers.scene.effects import Facts, plan_effects
-from workers.scene.plan import plan_scene
 
 TILTS_DEG = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 0.005, 0.02)
 LIFTS_MM = (0.005, 0.05, 0.09, 0.15)

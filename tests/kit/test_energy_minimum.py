@@ -10,7 +10,7 @@ from tests.physics.settling import settle_single
 from workers.assets.catalogue import open_catalogue
 from workers.geometry.frames import pose, rotation_about
 from workers.scene.chance import SceneChance
-from workers.scene.plan import plan_scene
+from workers.scene.draw.plan import plan_scene
 
 pytestmark = pytest.mark.minute
 

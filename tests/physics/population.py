@@ -27,7 +27,7 @@ from workers.assets.catalogue import Catalogue, open_catalogue
 from workers.geometry.frames import transform
 from workers.physics.support import sample_elevation
 from workers.scene.chance import SceneChance
-from workers.scene.plan import choose_category, plan_scene
+from workers.scene.draw.plan import choose_category, plan_scene
 
 GAP_MM, MOVE_MM, TURN_DEG = 0.1, 0.1, 0.1
 

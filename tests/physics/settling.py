@@ -18,7 +18,7 @@ from workers.physics.fall import FINEST
 from workers.physics.hold import moved_by, release_again
 from workers.physics.settle import RECHECK_S, settle_scene
 from workers.scene.chance import SceneChance
-from workers.scene.plan import draw_scene
+from workers.scene.draw.plan import draw_scene
 
 PHYSICS = Job(name="t").physics
 

@@ -23,7 +23,7 @@ from workers.assets.builtin.make import make_asset
 from workers.assets.catalogue import open_catalogue
 from workers.physics.support import place_table
 from workers.scene.chance import SceneChance
-from workers.scene.plan import draw_start
+from workers.scene.draw.plan import draw_start
 
 TABLE = place_table(table())
 SEEDS = 20

@@ -23,7 +23,7 @@ from workers.geometry.frames import pose, rotation_between, transform
 from workers.geometry.hull import convex_hull
 from workers.physics.support import DOWN, SAME_PLANE_M, place_table, support_margin
 from workers.scene.chance import SceneChance
-from workers.scene.plan import draw_start
+from workers.scene.draw.plan import draw_start
 
 TABLE = place_table(table())
 SIGNIFICANCE = 0.001

@@ -36,7 +36,7 @@ from workers.geometry.frames import add_up
 
 if TYPE_CHECKING:
     from workers.assets.library.table import Library
-    from workers.assets.pictures import Pictures
+    from workers.assets.look.pictures import Pictures
 
 AnySource = ProceduralSource | LibrarySource
 
@@ -184,7 +184,7 @@ class Catalogue:
         settings, library = self._sources(ref.category)[ref.source]
         if isinstance(settings, ProceduralSource):
             from workers.assets.builtin.make import make_asset
-            from workers.assets.recolour import recoloured
+            from workers.assets.look.recolour import recoloured
 
             asset = make_asset(ref.category, settings, ref.index, self.assets.density_of(ref.category))
             return asset if ref.category == TABLE else recoloured(asset, self.recolour)

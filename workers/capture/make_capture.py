@@ -40,7 +40,7 @@ from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import translation
 from workers.scene.chance import SceneChance
 from workers.scene.context import WorkerContext
-from workers.scene.plan import choose_assets
+from workers.scene.draw.plan import choose_assets
 from workers.stopwatch import Stopwatch
 from workers.store.file_system import temporary_folder
 

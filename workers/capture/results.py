@@ -25,7 +25,7 @@ from schemas.errors import AssetSourceError, CaptureError, InputError, command_l
 from schemas.job.job import Job
 from schemas.job.look import OFF, RECOLOUR_VERSION
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
-from workers.assets.environment import open_maps
+from workers.assets.look.environment import open_maps
 from workers.assets.poses import open_poses
 from workers.assets.scene_tables import open_scenes
 from workers.capture.folder import BOARD_FILE, CAMERA_FILE, CAPTURE_FILE, FILE_OF_VIEW
@@ -34,7 +34,7 @@ from workers.door.meshes.ply import Element, encode_ply, parse_ply
 from workers.door.opening import as_refusal
 
 if TYPE_CHECKING:
-    from workers.assets.pictures import Pictures
+    from workers.assets.look.pictures import Pictures
 
 PROCESS_FILE, CLOUD_FILE, MESH_FILE, POSES_FILE = "process.json", "cloud.ply", "mesh.ply", "poses.parquet"
 
@@ -176,7 +176,7 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
     pictures: Pictures = {}
     further = [file.sha256 for file in (*poses.values(), scenes) if file is not None]
     if look.folders:
-        from workers.assets.pictures import open_pictures
+        from workers.assets.look.pictures import open_pictures
 
         pictures = open_pictures(look, job_folder)
         further += [f"{key} {one.name} {one.sha256}" for key, some in pictures.items() for one in some]

@@ -15,12 +15,12 @@ from workers.physics.settle import Rest, keep_scene, recheck_scene, settle_scene
 from workers.scene.cameras import frame_cameras, place_more, require_aimed
 from workers.scene.chance import SceneChance
 from workers.scene.context import WorkerContext
+from workers.scene.draw.plan import plan_scene, pouring_of
+from workers.scene.draw.studio import stand_alone
+from workers.scene.draw.surround import surround
 from workers.scene.effects import BRANCHES, Facts, is_raycast_scene, plan_effects
 from workers.scene.pairs import SettledScene, make_further, make_pair
-from workers.scene.plan import plan_scene, pouring_of
 from workers.scene.ray_check import check_pair
-from workers.scene.studio import stand_alone
-from workers.scene.surround import surround
 from workers.stopwatch import Stopwatch
 
 

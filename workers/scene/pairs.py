@@ -16,7 +16,7 @@ from schemas.job.views import Images
 from schemas.scene.scene import EffectPlan, PosedScene, ScenePlan
 from schemas.scene.shape import is_object
 from schemas.scene.view import ROLES, VIEW_ROLES, Camera, Pair, Role, View
-from workers.assets.surroundings import require_camera_inside
+from workers.assets.look.surroundings import require_camera_inside
 from workers.geometry.pixels import dequantise_depth, quantise_depth
 from workers.render.pathtraced import draw_view
 from workers.scene.cameras import draw_mirror_share, place_beside, place_fixed, place_mirror_camera

@@ -15,7 +15,7 @@ from workers.geometry.camera import project
 from workers.geometry.frames import invert, transform, translation
 from workers.scene.cameras import frame_cameras, place_mirror_camera, place_orbits, points_of, require_depth
 from workers.scene.chance import SceneChance
-from workers.scene.plan import plan_scene
+from workers.scene.draw.plan import plan_scene
 
 SAMPLED = 8
 """Scenes that are planned at most. The first that can be framed is enough: one with bad luck is a row in `failures`."""

@@ -37,8 +37,8 @@ from workers.render.raster.gbuffer import Renderer
 from workers.render.tiers import require_tier
 from workers.scene.chance import SceneChance
 from workers.scene.context import WorkerContext, open_worker
+from workers.scene.draw.plan import choose_assets, choose_category
 from workers.scene.make_scene import make_scene
-from workers.scene.plan import choose_assets, choose_category
 from workers.scene.rows import failed_scene, record_scene, timing_row
 from workers.shard.fingerprint import take_fingerprint
 from workers.shard.framing import require_framed

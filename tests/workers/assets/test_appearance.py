@@ -7,7 +7,7 @@ import pytest
 
 from schemas.job.job import Job
 from tests.kit.shapes import asset_of, box, table
-from workers.assets.appearance import (
+from workers.assets.look.appearance import (
     FLOOR_KINDS,
     PERIOD_M,
     TEXTURE_PX,
@@ -16,7 +16,7 @@ from workers.assets.appearance import (
     make_pattern,
 )
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.plan import draw_scene
+from workers.scene.draw.plan import draw_scene
 
 BOX, TABLE = asset_of(box(0.1, 0.08, 0.2)), table()
 JOBS = {tier: Job.model_validate({"name": "t", "seed": 5, "render": {"tier": tier}}) for tier in ("flat", "raster")}

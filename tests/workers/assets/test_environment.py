@@ -9,9 +9,9 @@ from schemas.base import Counts, Range
 from schemas.errors import AssetSourceError, JobError, MeshError
 from schemas.job.look import BUILT_IN, Environment, Lights
 from services.job.job_file import validate_job
-from workers.assets import environment
-from workers.assets.environment import load_map, open_maps
-from workers.assets.lights import draw_environment, draw_lights, planckian_rgb
+from workers.assets.look import environment
+from workers.assets.look.environment import load_map, open_maps
+from workers.assets.look.lights import draw_environment, draw_lights, planckian_rgb
 from workers.capture.results import open_sources
 from workers.geometry.irradiance import LUMINANCE
 

@@ -28,7 +28,7 @@ from workers.door.meshes.urdf import load_posed
 from workers.pool import Answers
 from workers.scene.chance import SceneChance
 from workers.scene.context import open_worker
-from workers.scene.plan import draw_scene
+from workers.scene.draw.plan import draw_scene
 from workers.shard.run_shard import run_scene
 from workers.stopwatch import Stopwatch
 

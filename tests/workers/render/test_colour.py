@@ -41,7 +41,7 @@ from tests.workers.render.random_scenes import (
     with_material,
     without,
 )
-from workers.assets.appearance import STUDIO_LIGHTS
+from workers.assets.look.appearance import STUDIO_LIGHTS
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import decode_srgb, encode_srgb
 from workers.geometry.frames import translation

@@ -10,9 +10,9 @@ from schemas.job.look import BUILT_IN
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE, Appearance, Light, MapSource, Part, Shape
 from tests.workers.render.random_scenes import BLACK, EYE, FLAT, RASTER, camera, matte, paths, small, traced, without
-from workers.assets import environment
-from workers.assets.environment import expose_map, load_map, relight
-from workers.assets.lights import DrawnEnvironment
+from workers.assets.look import environment
+from workers.assets.look.environment import expose_map, load_map, relight
+from workers.assets.look.lights import DrawnEnvironment
 from workers.geometry.camera import orbit_pose
 from workers.geometry.colour import decode_codes
 from workers.geometry.frames import UP, rotation_about

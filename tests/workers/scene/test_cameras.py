@@ -27,8 +27,8 @@ from workers.assets.poses import open_poses, poses_of, read_poses
 from workers.capture.results import open_sources
 from workers.geometry.camera import look_at
 from workers.geometry.hull import hull_of
+from workers.scene.draw.studio import scaled_to
 from workers.scene.make_scene import make_scene
-from workers.scene.studio import scaled_to
 from workers.stopwatch import Stopwatch
 
 BAND = [0.35, 1.3]

@@ -11,7 +11,7 @@ import pytest
 import shapely
 import trimesh
 
-import workers.scene.plan as planning
+import workers.scene.draw.plan as planning
 from schemas.errors import StartError, ViewError
 from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, ScenePlan
@@ -24,8 +24,8 @@ from workers.geometry.hull import hull_of
 from workers.physics.support import APART_M, columns_apart, place_table
 from workers.scene.cameras import frame_cameras
 from workers.scene.chance import SceneChance, Stream
+from workers.scene.draw.plan import choose_assets, choose_category, count_objects, draw_scene, stands_on
 from workers.scene.effects import is_raycast_scene
-from workers.scene.plan import choose_assets, choose_category, count_objects, draw_scene, stands_on
 
 BOX = asset_of(box(0.1, 0.08, 0.2))
 TABLE = table()

@@ -20,9 +20,9 @@ from services.job.job_file import load_job, validate_job
 from services.job.record import decode_job, encode_job, record_job
 from tests.effects.cases import ABOVE_THE_HORIZON, PICTURES
 from tests.effects.scenes import Made, Setting, facts_of, make
-from workers.assets.pictures import KEPT_PX, LARGEST_PX, load_picture, open_pictures
-from workers.assets.recolour import palette_rows, recolour_colour, recolour_texture
-from workers.assets.surroundings import build_room, cover_floor, cover_table, draw_coat
+from workers.assets.look.pictures import KEPT_PX, LARGEST_PX, load_picture, open_pictures
+from workers.assets.look.recolour import palette_rows, recolour_colour, recolour_texture
+from workers.assets.look.surroundings import build_room, cover_floor, cover_table, draw_coat
 from workers.capture.results import open_sources
 from workers.geometry.camera import unproject
 from workers.geometry.pixels import fill_image

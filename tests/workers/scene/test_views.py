@@ -26,6 +26,7 @@ from workers.geometry.pixels import Extent, distort
 from workers.geometry.raycast import cast_view, edge_distance_px
 from workers.scene.cameras import mirror_pose
 from workers.scene.chance import SceneChance
+from workers.scene.draw.plan import draw_scene
 from workers.scene.labels import (
     carry_depth,
     compare_views,
@@ -40,7 +41,6 @@ from workers.scene.labels import (
 )
 from workers.scene.make_scene import pose_scene
 from workers.scene.pairs import object_distance
-from workers.scene.plan import draw_scene
 from workers.scene.ray_check import STEEPEST_COS, check_against_rays, check_pair
 from workers.stopwatch import Stopwatch
 from workers.targets.targets import Sight, draw_targets

@@ -23,7 +23,7 @@ from schemas.scene.shape import (
     Shape,
 )
 from schemas.scene.view import Intrinsics
-from workers.assets.appearance import draw_appearance
+from workers.assets.look.appearance import draw_appearance
 from workers.capture.board import TOUCHING_M, board_geometry, marker_cells, marker_corners
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, translation

@@ -19,8 +19,8 @@ from schemas.job.look import Clutter
 from schemas.job.physics import Start
 from schemas.scene.scene import Ground, ObjectStart, ScenePlan, Table
 from schemas.scene.shape import REGION_FIRST_CLUTTER, REGION_FIRST_OBJECT, Asset, Hull, Mesh
-from workers.assets.appearance import draw_appearance
 from workers.assets.catalogue import Catalogue, InstanceRef, choose_object, choose_table, load_asset
+from workers.assets.look.appearance import draw_appearance
 from workers.assets.scene_tables import GivenScene
 from workers.geometry.frames import UP, pose, rotation_about, transform, translation, uniform_rotation
 from workers.geometry.hull import hull_of
@@ -28,8 +28,8 @@ from workers.physics.pour import Pouring, points_of
 from workers.physics.support import columns_apart, place_table, sample_elevation, support_height, support_margin
 from workers.scene.cameras import draw_camera
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.given import choose_given, put_given, read_given
-from workers.scene.studio import draw_studio
+from workers.scene.draw.given import choose_given, put_given, read_given
+from workers.scene.draw.studio import draw_studio
 
 MOST_REDRAWS = 20
 """Of a position that is not over the table or has no room, and of an object that was lost: hardly a scene needs five."""

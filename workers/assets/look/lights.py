@@ -8,7 +8,7 @@ import numpy as np
 from schemas.base import Array, Range, frozen_array
 from schemas.job.look import BUILT_IN, Environment, Lights
 from schemas.scene.shape import Light, MapSource
-from workers.assets.appearance import ALBEDO_IN_LIGHT
+from workers.assets.look.appearance import ALBEDO_IN_LIGHT
 from workers.geometry.irradiance import LUMINANCE
 
 RGB = tuple[float, float, float]

@@ -9,12 +9,12 @@ from schemas.job.look import Look, Surface
 from schemas.scene.scene import ScenePlan
 from schemas.scene.shape import Appearance, Shape
 from workers.assets.catalogue import Catalogue
-from workers.assets.environment import relight
-from workers.assets.lights import describe_lights, draw_environment, draw_lights
-from workers.assets.pictures import load_picture
-from workers.assets.surroundings import Coat, build_room, cover_floor, cover_table, draw_coat, require_table_inside
+from workers.assets.look.environment import relight
+from workers.assets.look.lights import describe_lights, draw_environment, draw_lights
+from workers.assets.look.pictures import load_picture
+from workers.assets.look.surroundings import Coat, build_room, cover_floor, cover_table, draw_coat, require_table_inside
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.plan import add_clutter
+from workers.scene.draw.plan import add_clutter
 
 FLOOR, TABLE, BACKGROUND, ROOM = range(4)
 """Parts of the stream of surroundings."""

@@ -11,7 +11,7 @@ from schemas.job.job import Job
 from schemas.job.views import Studio
 from schemas.scene.scene import ObjectStart, ScenePlan, Settled
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, MassProperties, Shape
-from workers.assets.appearance import studio_light
+from workers.assets.look.appearance import studio_light
 from workers.geometry.frames import UP, pose, rotation_about, uniform_rotation
 from workers.geometry.hull import hull_of
 from workers.scene.cameras import draw_camera

@@ -15,8 +15,8 @@ from schemas.job.look import Room, Surface
 from schemas.scene.scene import Walls
 from schemas.scene.shape import Asset, Material, Part, Shape
 from schemas.scene.view import Camera
-from workers.assets.appearance import floor_uv
-from workers.assets.pictures import Picture, load_picture
+from workers.assets.look.appearance import floor_uv
+from workers.assets.look.pictures import Picture, load_picture
 from workers.geometry.colour import encode_srgb
 from workers.geometry.mesh import face_planes
 

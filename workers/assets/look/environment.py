@@ -17,9 +17,9 @@ from schemas.base import frozen_array
 from schemas.environment import cache_folder
 from schemas.errors import AssetSourceError, InputError, MeshError
 from schemas.scene.shape import Appearance, Light, MapSource, Surround
-from workers.assets.appearance import ALBEDO_IN_LIGHT
-from workers.assets.lights import DrawnEnvironment, DrawnLights, rgb
-from workers.assets.skies import HEIGHT, make_sky
+from workers.assets.look.appearance import ALBEDO_IN_LIGHT
+from workers.assets.look.lights import DrawnEnvironment, DrawnLights, rgb
+from workers.assets.look.skies import HEIGHT, make_sky
 from workers.door.opening import read_bytes
 from workers.door.radiance import MOST_BYTES, read_radiance
 from workers.geometry.frames import UP, rotation_about
