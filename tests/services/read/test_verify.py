@@ -103,7 +103,8 @@ def vouched_bytes(out: Path) -> None:
     views = pq.read_table(out / VIEWS, partitioning=None).drop_columns("capture")
     scenes = pq.read_table(path := next(out.glob("manifest/scenes/*/*")), partitioning=None)
     at = scenes.schema.get_field_index("bodies")
-    body = [field.with_nullable(field.name.startswith("recheck")) for field in scenes.schema.types[at].value_type]
+    missing = ("recheck_move_mm", "recheck_turn_deg", "friction")
+    body = [field.with_nullable(field.name in missing) for field in scenes.schema.types[at].value_type]
     solid = scenes.schema.set(at, pa.field("bodies", pa.list_(pa.struct(body))))
     pq.write_table(views, out / VIEWS, compression="gzip")
     pq.write_table(scenes.cast(solid), path)
