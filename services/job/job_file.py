@@ -159,22 +159,25 @@ def name_of(path: Path) -> str:
     return "the packed job" if is_packed(str(path)) else plain_line(str(path), 300)
 
 
-def folders_of(job: Job) -> dict[str, str]:
-    """Every folder that the job names, by its key."""
+def paths_of(job: Job) -> dict[str, str]:
+    """Every folder and file that the job names, by its key."""
     sources = {
         f"assets.{branch}.{number}.folder": getattr(source, "folder", "")
         for branch in ("objects", "tables")
         for number, source in enumerate(getattr(job.assets, branch))
     }
-    folders = job.captures.folders if job.captures is not None else []
-    return sources | job.look.folders | {f"captures.folders.{number}": name for number, name in enumerate(folders)}
+    folders, around = job.captures.folders if job.captures is not None else [], job.look.environment
+    named: dict[str, str | None] = {f"captures.folders.{number}": name for number, name in enumerate(folders)}
+    named |= {f"cameras.more.{number}.poses": entry.poses for number, entry in enumerate(job.cameras.more)}
+    named |= {"look.environment.folder": around.folder if around else None, "scenes_from": job.scenes_from}
+    return sources | job.look.folders | {key: path for key, path in named.items() if path}
 
 
 def refuse_folders(job: Job, name: str, fits: Callable[[str], bool], why: str) -> None:
     """Raises JobError for a folder of the job that does not fit where the job is to run; `told` says why, and the remedy."""
     from workers.assets.library.making import PYBULLET_DATA
 
-    for key, folder in folders_of(job).items():
+    for key, folder in paths_of(job).items():
         if folder not in ("", PYBULLET_DATA) and not fits(folder):
             raise JobError(f"{name}: {key}: {plain_line(repr(folder))}: {why}")
 
@@ -187,7 +190,7 @@ def _check_absolute(job: Job, name: str) -> None:
 
 def _check_homes(job: Job, name: str) -> None:
     """Raises JobError for a folder that begins with the name of a user whom this machine does not know."""
-    for key, folder in folders_of(job).items():
+    for key, folder in paths_of(job).items():
         try:
             Path(folder).expanduser()
         except RuntimeError as error:

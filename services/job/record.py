@@ -11,7 +11,7 @@ import yaml
 from schemas.dataset.layout import JOB_FILE, LOCK_FILE, LOG_FOLDER, MANIFEST, STAGING, SUCCESS_FILE, is_merged_path
 from schemas.errors import CorruptError, JobError, OutputError, did_you_mean
 from schemas.job.job import Job, compare_jobs, job_digest
-from services.job.job_file import parse_yaml, validate_job
+from services.job.job_file import parse_yaml, paths_of, validate_job
 from workers.store.commit import is_sealed, seal
 from workers.store.store import Store
 
@@ -56,7 +56,8 @@ class JobRecord:
             return f"the files of the captures in {', '.join(changed[:5])}{' and more' if len(changed) > 5 else ''}"
         if len(self.inputs) != len(inputs):
             return f"captures.folders, which were {len(self.inputs)} and are {len(inputs)}"
-        return "the files of the asset folders"
+        named = [key for key, path in paths_of(self.job).items() if path]
+        return " or ".join([*(f"the files that {key} names" for key in named), "the built-in shapes of this version"])
 
 
 def record_job(

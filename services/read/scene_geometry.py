@@ -83,7 +83,8 @@ class Sources:
         except (VersoError, OSError) as error:
             return error
         if catalogue.digest != self._record.catalogue:
-            return MachineError("the files of the asset folders do not hold what they held when this job was run")
+            changed = self._record.describe_change(tuple(listing.sha256 for listing in catalogue.captures))
+            return MachineError(f"{changed} do not hold what they held when this job was run")
         return catalogue
 
 

@@ -1,5 +1,6 @@
 """OUT/job.yaml: what goes in comes back, and another job or another's folder is refused."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,7 @@ import yaml
 
 from schemas.dataset.layout import JOB_FILE
 from schemas.errors import CorruptError, OutputError
-from schemas.job.job import Job
+from schemas.job.job import PATHS, Job
 from services.job.record import JobRecord, encode_job, is_job_sealed, read_job, record_job, refuse_foreign, require_job
 from workers.store.local import LocalStore
 
@@ -44,8 +45,22 @@ def test_more_scenes_go_on_with_the_first_range_size_and_another_job_is_refused_
     assert adopted.digest == record(scenes=9).digest
     with pytest.raises(OutputError, match="seed: 0 there, 3 here"):
         record(seed=3, out=store)
-    with pytest.raises(OutputError, match="files of the asset folders"):
+    with pytest.raises(OutputError, match="  the built-in shapes of this version "):
         record("other", out=store)
+
+
+def test_whatever_files_a_job_names_are_named_where_some_have_changed(store):
+    keys = {
+        "assets": {"objects": [{"source": "library", "folder": "x"}], "tables": [{"source": "library", "folder": "x"}]},
+        "cameras": {"more": [{"name": "a", "poses": "x"}]},
+        "look": {name: {"folder": "x"} for name in ("floor", "table", "environment")} | {"background": "x"},
+        "scenes_from": "x",
+    }
+    store.put(JOB_FILE, encode_job(record(**keys)))
+    with pytest.raises(OutputError) as caught:
+        record("other", out=store, **keys)
+    named = {re.sub(r"\.\d+", "", key) for key in re.findall(r"the files that (\S+) names", str(caught.value))}
+    assert named == PATHS - {"captures.folders"}
 
 
 def test_captures_whose_files_changed_are_named_by_their_folders(store):
