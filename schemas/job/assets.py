@@ -133,14 +133,15 @@ def with_categories(tree: dict[str, Any]) -> dict[str, Any]:
     """The keys of a job with `categories`: where there are none, all that its sources offer, with equal weights."""
     if "categories" in tree:
         return tree
-    return {**tree, "categories": dict.fromkeys(offered_by(_sources(tree)) or CATEGORIES, 1.0)}
+    return {**tree, "categories": dict.fromkeys(offered_by(sources_of(tree)) or CATEGORIES, 1.0)}
 
 
-def _sources(tree: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def sources_of(tree: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The sources of objects in the keys of a job, of which any may be missing or wrong."""
     assets = tree.get("assets")
-    listed = assets.get("objects") if isinstance(assets, dict) else None
+    listed = assets.get("objects") if isinstance(assets, Mapping) else None
     sources = listed if isinstance(listed, list) else [{"source": "procedural"}]
-    return [source for source in sources if isinstance(source, dict)]
+    return [source for source in sources if isinstance(source, Mapping)]
 
 
 def describe_unknown(names: Iterable[str], offered: Sequence[str], key: str = "categories") -> str:

@@ -16,7 +16,16 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, Field, field_validator, model_validator
 
 from schemas.base import Folder, Frozen, NonNegativeInt, Positive, PositiveInt, Seed, Share, Weight, with_defaults
-from schemas.job.assets import CATEGORIES, TABLE, Assets, CategoryName, describe_unknown, offered_by, with_categories
+from schemas.job.assets import (
+    CATEGORIES,
+    TABLE,
+    Assets,
+    CategoryName,
+    describe_unknown,
+    offered_by,
+    sources_of,
+    with_categories,
+)
 from schemas.job.cameras import Cameras
 from schemas.job.captures import Captures, with_capture_keys
 from schemas.job.look import OF_COLOUR, Look
@@ -122,12 +131,7 @@ def kind_of(tree: Keys) -> JobKind:
     count = tree.get("objects_per_scene", 1)
     if (count[-1:] if isinstance(count, list | tuple) else [count]) not in ([1], (1,)):
         return "piles"
-    assets = tree.get("assets")
-    sources = assets.get("objects") if isinstance(assets, Mapping) else None
-    kinds = (
-        [source.get("source") for source in sources if isinstance(source, Mapping)] if isinstance(sources, list) else []
-    )
-    return "singles" if all(kind == "procedural" for kind in kinds) else "meshes"
+    return "singles" if all(source.get("source") == "procedural" for source in sources_of(tree)) else "meshes"
 
 
 def with_preset(tree: Keys) -> dict[str, Any]:

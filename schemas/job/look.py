@@ -35,7 +35,7 @@ def _within(low: float, high: float) -> AfterValidator:
 
 
 MOST_LIGHTS = 6
-"""As many as the renderer has room for."""
+"""Of a scene: more do not fit into the 60 floats between the two shaders that OpenGL 4.1 guarantees."""
 
 
 class Lights(Frozen):

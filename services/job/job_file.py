@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from schemas.base import VALUE_KINDS, set_key, with_defaults
 from schemas.dataset.layout import SWITCHES, is_stored
 from schemas.errors import JobError, did_you_mean, plain_line
-from schemas.job.assets import SOURCE_KINDS
+from schemas.job.assets import SOURCE_KINDS, offered_by, sources_of
 from schemas.job.job import Job
 from schemas.job.look import OF_COLOUR
 from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
@@ -134,13 +134,7 @@ def with_usual_colours(tree: Mapping[str, Any]) -> dict[str, Any]:
 
     The record of a job made before there was `look.recolour` has no such key, and its objects are as they were made.
     """
-    branch = tree.get("assets")
-    sources = (
-        branch.get("objects", [{"source": "procedural"}]) if isinstance(branch, Mapping) else [{"source": "procedural"}]
-    )
-    listed = [source for source in sources if isinstance(source, Mapping)] if isinstance(sources, list) else []
-    built_in = any(source.get("source") == "procedural" for source in listed)
-    return with_defaults(tree, {"look.recolour": "packaging"} if built_in else {})
+    return with_defaults(tree, {"look.recolour": "packaging"} if offered_by(sources_of(tree)) else {})
 
 
 def pack_job(path: Path) -> str:

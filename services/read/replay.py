@@ -1,7 +1,6 @@
 """`verso replay`: makes scenes again from their job, and compares them with what is stored."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -13,12 +12,12 @@ from schemas.dataset.layout import (
 )
 from schemas.dataset.shard import Fingerprint
 from schemas.dataset.tables import DETERMINISTIC_TABLES, SCHEMAS, SORT_KEYS
-from schemas.errors import CorruptError, MachineError
+from schemas.errors import CorruptError
 from schemas.job.job import job_digest
 from schemas.scene.scene import SceneOutput
 from services.job.record import JobRecord, require_job
 from services.read.dataset_reader import StoredRange, committed_reader, decode_samples, file_reader, find_scene
-from workers.capture.results import open_sources
+from services.read.scene_geometry import open_recorded
 from workers.scene.context import WorkerContext, open_worker
 from workers.shard.fingerprint import take_fingerprint
 from workers.shard.run_shard import run_scene
@@ -71,11 +70,7 @@ def replay_scene(store: Store, scene_id: int) -> Replay:
 
 def open_context(record: JobRecord) -> WorkerContext:
     """The context that makes a stored job's scenes here. Raises MachineError where the assets have changed."""
-    catalogue = open_sources(record.job, Path(record.folder))
-    if catalogue.digest != record.catalogue:
-        changed = record.describe_change(tuple(listing.sha256 for listing in catalogue.captures))
-        raise MachineError(f"{changed} (from {record.folder}) do not hold what they held when this job was run")
-    return open_worker(record.job, catalogue)
+    return open_worker(record.job, open_recorded(record))
 
 
 def is_same_stack(store: Store, context: WorkerContext) -> bool:

@@ -76,16 +76,21 @@ class Sources:
     @cached_property
     def _opened(self) -> "Catalogue | VersoError | OSError":
         """The job's catalogue, or why it cannot be used: found once, because every file of the sources is read for it."""
-        from workers.capture.results import open_sources
-
         try:
-            catalogue = open_sources(self._record.job, Path(self._record.folder))
+            return open_recorded(self._record)
         except (VersoError, OSError) as error:
             return error
-        if catalogue.digest != self._record.catalogue:
-            changed = self._record.describe_change(tuple(listing.sha256 for listing in catalogue.captures))
-            return MachineError(f"{changed} do not hold what they held when this job was run")
-        return catalogue
+
+
+def open_recorded(record: JobRecord) -> "Catalogue":
+    """The catalogue of a stored job. Raises MachineError where its files are others now, and as `open_sources`."""
+    from workers.capture.results import open_sources
+
+    catalogue = open_sources(record.job, Path(record.folder))
+    if catalogue.digest != record.catalogue:
+        changed = record.describe_change(tuple(listing.sha256 for listing in catalogue.captures))
+        raise MachineError(f"{changed} (from {record.folder}) do not hold what they held when this job was run")
+    return catalogue
 
 
 def load_glb(data: bytes, path: str) -> Mapping[str, trimesh.Trimesh]:

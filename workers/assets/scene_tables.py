@@ -104,6 +104,7 @@ def open_scenes(job: Job, folder: Path) -> PoseFile | None:
         return PoseFile(path, hashlib.sha256(lines.encode()).hexdigest())
 
 
+@lru_cache(maxsize=8)  # who chooses the shapes asks, and who places them
 def read_scene(file: PoseFile, scene_id: int) -> GivenScene:
     """The objects and cameras of a scene, found sound. Raises StartError that names the row and the value."""
     where = f"scene {scene_id} in {file.path}"

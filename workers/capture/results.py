@@ -179,7 +179,7 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
         from workers.assets.look.pictures import open_pictures
 
         pictures = open_pictures(look, job_folder)
-        further += [f"{key} {one.name} {one.sha256}" for key, some in pictures.items() for one in some]
+        further += [f"{key} {file.name} {file.sha256}" for key, files in pictures.items() for file in files]
     around = job.look.environment  # also of tier flat: a study compares it with the path-traced tier
     maps = () if around is None else open_maps(around.folder, job_folder)
     further += [f"{source.name} {source.sha256}" for source in maps]
@@ -188,8 +188,9 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
     if further:
         whole = "\n".join([catalogue.digest, *further])
         digest = hashlib.sha256(whole.encode()).hexdigest()
-        catalogue = replace(catalogue, poses=poses, scenes=scenes, pictures=pictures, maps=maps)
-        catalogue = replace(catalogue, recolour=look.recolour, digest=digest)
+        catalogue = replace(
+            catalogue, poses=poses, scenes=scenes, pictures=pictures, maps=maps, recolour=look.recolour, digest=digest
+        )
     if job.captures is None or not job.captures.folders:
         return catalogue
     listings, folders = [], job.captures.folders

@@ -46,6 +46,7 @@ from schemas.scene.view import Camera, GBuffer, Intrinsics
 from workers.geometry.camera import NEAR_M
 from workers.geometry.colour import HOLE_ALPHA, SRGB_STEPS, decode_srgb, encode_codes, has_holes
 from workers.geometry.frames import UP, pose, rotation_about, transform
+from workers.geometry.irradiance import LUMINANCE
 from workers.geometry.pixels import fill_image
 from workers.render.raster.batches import MATTE_ROUGHNESS, texture_of
 from workers.render.raster.gbuffer import Renderer
@@ -408,7 +409,7 @@ def clamp_fireflies(light: Array) -> Array:
     """
     from scipy.ndimage import rank_filter  # takes 36 ms to load, and every worker loads this file
 
-    level = light @ np.array([0.2126, 0.7152, 0.0722])
+    level = light @ LUMINANCE
     ring = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
     border = "mirror" if min(level.shape) > 1 else "nearest"
     second = rank_filter(level, -2, footprint=ring, mode=border)

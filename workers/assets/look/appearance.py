@@ -9,7 +9,6 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from schemas.base import Array, frozen_array
 from schemas.job.views import Studio, Tier
 from schemas.scene.shape import Appearance, Light, Material, Part, Shape
-from workers.assets.builtin.materials import Plane, Texture, stretched
+from workers.assets.builtin.materials import Color, Plane, Texture, stretched
 from workers.geometry.colour import decode_srgb
 
 FLOOR_HALF_M = 30.0
@@ -137,8 +136,6 @@ def _tint(level: float, warmth: float) -> tuple[float, float, float]:
 TEXTURE_PX = 512
 PERIOD_M = (2.6, 4.2)
 """After how many metres a pattern repeats: more than a camera of the default orbit sees of the floor nearby."""
-
-Color: TypeAlias = tuple[float, float, float]
 
 _SEED = 48_271
 """Seed of the collection, which is the same in every dataset."""

@@ -16,6 +16,7 @@ import numpy as np
 from schemas.base import frozen_array
 from schemas.environment import cache_folder
 from schemas.errors import AssetSourceError, InputError, MeshError
+from schemas.job.look import MOST_LIGHTS
 from schemas.scene.shape import Appearance, Light, MapSource, Surround
 from workers.assets.look.appearance import ALBEDO_IN_LIGHT
 from workers.assets.look.lights import DrawnEnvironment, DrawnLights, rgb
@@ -36,9 +37,6 @@ from workers.geometry.irradiance import (
 )
 from workers.pool import Answers, Ended, Limits, run_pool
 from workers.source import code_digest
-
-MOST_LIGHTS = 6
-"""Of a scene: what shaders have room for."""
 
 MOST_EXPOSED = 2.0
 """Light on a white surface, wherever it faces: a low sun would leave nothing but white else."""

@@ -8,10 +8,9 @@ import numpy as np
 from schemas.base import Array, Range, frozen_array
 from schemas.job.look import BUILT_IN, Environment, Lights
 from schemas.scene.shape import Light, MapSource
+from workers.assets.builtin.materials import Color
 from workers.assets.look.appearance import ALBEDO_IN_LIGHT
 from workers.geometry.irradiance import LUMINANCE
-
-RGB = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +23,8 @@ class DrawnLights:
     lights: tuple[Light, ...]
     temperatures_k: tuple[float, ...]
     rest: float
-    ambient: RGB
-    below: RGB
+    ambient: Color
+    below: Color
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +105,7 @@ def draw_environment(rng: np.random.Generator, spec: Environment, maps: tuple[Ma
     return DrawnEnvironment(source, math.radians(float(rng.uniform(*spec.turn_deg))))
 
 
-def rgb(color: Array) -> RGB:
+def rgb(color: Array) -> Color:
     """Three numbers of an array."""
     red, green, blue = color.tolist()
     return red, green, blue

@@ -11,13 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from workers.assets.builtin.materials import Color
+from workers.geometry.frames import UP
 from workers.geometry.irradiance import LUMINANCE, Map, irradiance, map_directions, reduce_map
 
 HEIGHT = 512
 """Rows of a map."""
-
-RGB = tuple[float, float, float]
-UP = np.array([[0.0, 0.0, 1.0]])
 
 
 def make_sky(name: str) -> Map:
@@ -41,9 +40,9 @@ class Sky:
     coefficients: tuple[float, float, float, float, float]
     elevation_rad: float
     sun_share: float
-    sun: RGB
-    zenith: RGB
-    horizon: RGB
+    sun: Color
+    zenith: Color
+    horizon: Color
 
 
 SUN_RAD = 0.012
@@ -63,7 +62,7 @@ def _draw_sky(sky: Sky, directions: Map) -> Map:
     picture = level[..., None] * (high * np.array(sky.zenith) + (1.0 - high) * np.array(sky.horizon))
     above = directions[..., 2:] > 0.0
     picture = np.where(above, picture, 0.0).astype(np.float32)
-    diffuse = irradiance(reduce_map(picture, 64), UP)[0]
+    diffuse = irradiance(reduce_map(picture, 64), UP[None])[0]
     disc = 1.0 - _smooth(0.9 * SUN_RAD, 1.1 * SUN_RAD, away)
     # A disc of radiance L at elevation h gives L sin(h) pi r^2 / pi to a level surface.
     strength = sky.sun_share / (1.0 - sky.sun_share) * (diffuse @ LUMINANCE) / (sun[2] * SUN_RAD**2)
@@ -83,7 +82,7 @@ class Patch:
     side: int
     low: tuple[float, float]
     high: tuple[float, float]
-    radiance: RGB
+    radiance: Color
     bars: int = 0
     """Into how many panes frames divide it, both ways."""
 
@@ -92,11 +91,11 @@ class Patch:
 class Room:
     """A box about the origin: its lower and upper corner, colours of walls, floor and ceiling, patches, and light on all."""
 
-    low: RGB
-    high: RGB
-    walls: RGB
-    floor: RGB
-    ceiling: RGB
+    low: Color
+    high: Color
+    walls: Color
+    floor: Color
+    ceiling: Color
     patches: Sequence[Patch]
     fill: float
 

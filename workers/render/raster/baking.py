@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
 from schemas.scene.scene import Placed
-from schemas.scene.shape import LAMP_RAD
+from schemas.scene.shape import LAMP_RAD, Mesh
 from workers.geometry.frames import transform
 from workers.geometry.jit import compiled_for
-from workers.geometry.mesh import bounds_of
+from workers.geometry.mesh import bounds_of, join_meshes
 
 DIRECTIONS = 8
 REACHES = (1.0, 2.0, 3.5, 5.5, 8.5, 12.5, 18.0)
@@ -293,10 +293,8 @@ def _blend_shadows(
 
 def triangles_of(things: Sequence[Placed]) -> Triangles:
     """The triangles of all things together."""
-    vertices = [transform(thing.T_world_shape, thing.shape.vertices) for thing in things]
-    starts = np.cumsum([0, *(len(points) for points in vertices)])[:-1]
-    faces = [thing.shape.faces + start for thing, start in zip(things, starts, strict=True)]
-    return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
+    mesh = join_meshes([Mesh(transform(each.T_world_shape, each.shape.vertices), each.shape.faces) for each in things])
+    return mesh.vertices, mesh.faces
 
 
 def shadow_filter(light: Box, lamp_rad: float = LAMP_RAD) -> tuple[float, float, float]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array, Pose
+from schemas.job.look import MOST_LIGHTS
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FLOOR, REGION_TABLE, Appearance, Shape
 from schemas.scene.view import Intrinsics
@@ -22,7 +23,7 @@ from workers.geometry.frames import transform
 from workers.geometry.irradiance import turn_polynomials
 from workers.render.raster.batches import Cover, is_matte, seen_ranges, texture_of
 from workers.render.raster.buffers import Uploaded, UploadedShape
-from workers.render.raster.shaders import MAX_LIGHTS, Variant
+from workers.render.raster.shaders import Variant
 
 LEVEL_UNIT, SHADOW_UNIT = 1, 2
 """Texture units of the light maps; unit 0 is the albedo's."""
@@ -135,15 +136,15 @@ class Program:
 
 
 def light_slots(appearance: Appearance, raster: bool) -> int:
-    """Number of lights that the program has: one, two for tier flat, three or `MAX_LIGHTS`, unused ones dark.
+    """Number of lights that the program has: one, two for tier flat, three or `MOST_LIGHTS`, unused ones dark.
 
     Each number of lights needs programs of its own, of some megabytes each. All scenes of tier flat have two lights; those of
-    tier raster have one, two or three. Raises ValueError above `MAX_LIGHTS`.
+    tier raster have one, two or three. Raises ValueError above `MOST_LIGHTS`.
     """
-    for slots in (1, 3, MAX_LIGHTS) if raster else (1, 2, 3, MAX_LIGHTS):
+    for slots in (1, 3, MOST_LIGHTS) if raster else (1, 2, 3, MOST_LIGHTS):
         if len(appearance.lights) <= slots:
             return slots
-    raise ValueError(f"{len(appearance.lights)} lights: the renderer takes at most {MAX_LIGHTS}")
+    raise ValueError(f"{len(appearance.lights)} lights: the renderer takes at most {MOST_LIGHTS}")
 
 
 def _link(gl: ModuleType, vertex: str, fragment: str) -> int:

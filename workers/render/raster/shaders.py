@@ -21,12 +21,9 @@ from workers.render.raster.lit_shaders import (
 GRAZING = 0.01
 """Cosine of incidence below which a face's plane does not determine z."""
 
-MAX_LIGHTS = 6
-"""More do not fit into the 60 floats between the two shaders that OpenGL 4.1 guarantees."""
-
 
 class Variant(NamedTuple):
-    """The choices that one program is compiled for; `lights` is from 1 to `MAX_LIGHTS`."""
+    """The choices that one program is compiled for; `lights` is from 1 to `MOST_LIGHTS`."""
 
     color: bool
     """False: depth and region alone, without textures and lights."""
