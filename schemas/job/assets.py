@@ -60,7 +60,7 @@ TABLE_KINDS: tuple[str, ...] = get_args(TableKind)
 CATEGORIES = tuple(name for name in BUILT_IN if name not in TABLE_KINDS)
 """The built-in categories of objects; the first eight are the article's."""
 
-VERSION = 2
+VERSION = 3
 """Version of the built-in shapes, part of a catalogue's digest: raise it with every change to a vertex or colour."""
 
 

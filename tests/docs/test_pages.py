@@ -38,7 +38,7 @@ from workers.capture.simulate.simulate import simulate_capture
 from workers.scene.chance import SceneChance
 
 ROOT = Path(__file__).resolve().parents[2]
-DIGEST = "242487cbd017d6a1657b487f84477dd91e05013f5655de113bf955d02160b5e8"
+DIGEST = "8e0766d758f3dc1a44bd188d1c050011348bd71978498ac5458bca0a9fe7a858"
 FIRST = "./verso run deploy/jobs/tabletop.yaml"
 
 ELSEWHERE = {

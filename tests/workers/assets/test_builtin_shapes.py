@@ -15,11 +15,13 @@ import trimesh
 from shapely.geometry import Polygon
 
 from schemas.job.assets import CATEGORIES, ProceduralSource, instance_id
+from schemas.scene.shape import Mesh
 from tests.workers.door.oracles import faulty_rays, hits, support_margin, welded
 from workers.assets.builtin import box, camera, closed_vessels, laptop, open_vessels, table
 from workers.assets.builtin.make import make_asset, make_model, shape_digest
 from workers.assets.builtin.solid import Solid, union
 from workers.assets.builtin.sweeps import INSIDE, OUTSIDE
+from workers.assets.winding import winding_of_closed
 
 SOURCE = ProceduralSource(source="procedural")
 EVERYTHING = (*CATEGORIES, "table")
@@ -70,6 +72,7 @@ def check_body(category: str, index: int) -> trimesh.Trimesh:
 def check_asset(category: str, index: int) -> None:
     """Its size, its frame, its normals, its pictures and its faces."""
     one, limits = asset(category, index), SIZES_M[category]
+    assert wound_wrongly(make_model(category, 0, index).solid) == 0
     size = float(np.linalg.norm(one.extents_m))
     metric = make_asset(category, SOURCE.model_copy(update={"size": "metric"}), index, 600.0)
     if category == "table":
@@ -111,6 +114,19 @@ def check_lofts(category: str, index: int) -> None:
             along = np.diff(loft.rings, axis=0)  # from each ring to the next, at each place around
             middle = np.diff(loft.rings.mean(axis=1), axis=0)[:, None]
             assert ((along * middle).sum(axis=2) > 0).all(), "where it folds, its inner side runs back"
+
+
+def wound_wrongly(solid: Solid) -> int:
+    """Faces of a closed body that do not have its inside behind them, once, and nothing before them."""
+    a, b, c = (solid.vertices[solid.faces[:, k]] for k in range(3))
+    across = np.cross(b - a, c - a)
+    area = np.linalg.norm(across, axis=1)
+    large = area > 1e-10
+    normals, middles = across[large] / area[large, None], (a + b + c)[large] / 3.0
+    inside, before = (
+        winding_of_closed(middles + side * 2e-7 * normals, Mesh(solid.vertices, solid.faces)) for side in (-1.0, 1.0)
+    )
+    return int(((inside != 1) | (before != 0)).sum())
 
 
 def bottom(solid: Solid) -> tuple[float, float]:
@@ -249,6 +265,13 @@ def test_every_instance_is_a_faultless_body_of_the_size_and_form_of_its_kind(cat
 def test_no_wall_of_a_vessel_crosses_itself_and_no_handle_folds(category):
     for index in range(100, 250):
         check_lofts(category, index)
+
+
+def test_no_lens_folds_however_short_it_is():
+    for kind, height in ((0, 0.066), (1, 0.062), (2, 0.049)):
+        for seed in range(40):
+            lens = camera._lens(np.random.default_rng(seed), (height / 0.54, 0.3 * height / 0.54, height), kind)
+            assert wound_wrongly(lens) == 0, f"kind {kind}, seed {seed}"
 
 
 def test_the_lid_overhangs_the_box_and_a_ribbon_goes_all_around():

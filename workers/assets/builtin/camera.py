@@ -54,10 +54,13 @@ def _lens(rng: np.random.Generator, size: tuple[float, float, float], kind: int)
     length = radius * rng.uniform(*((1.0, 1.7), (0.6, 1.2), (0.35, 0.8))[kind])
     front = radius * rng.uniform(0.8, 1.0)
     a, b = rng.uniform(0.25, 0.4), rng.uniform(0.6, 0.8)
+    # Steps and grooves shrink on a short lens: at least a fifth of its length lies between two barrels, and the first
+    # barrel's groove, 2 mm, has to end before the second begins.
+    detail = min(1.0, length / 0.012)
     steps = [0.0, 1.0, 1.0, 0.94, 0.94, 0.99, 0.99, 0.95, 0.95, 0.84, 0.66, 0.6, 0.34, 0.0]
     starts = np.repeat([-0.2 * depth, a * length, b * length, length], [2, 4, 2, 6])
     sunk = radius * np.array([-0.22, -0.22, -0.1, -0.06])
-    ends = starts + np.array([0.0, 0.0, 0.0, 0.0005, 0.0015, 0.002, 0.0, 0.001, 0.0, 0.0, *sunk])
+    ends = starts + np.array([*(detail * np.array([0, 0, 0, 0.0005, 0.0015, 0.002, 0, 0.001, 0, 0])), *sunk])
     corners = np.column_stack([np.repeat([radius, front], 7) * steps, ends])
     radii = [0.0, 0.0, 0.0008, 0.0, 0.0, 0.0, 0.0008, 0.0, 0.001, 0.0, 0.0, 0.0, 0.05 * radius, 0.0]
     surface = np.array([*[LENS] * 3, RING, *[LENS] * 7, GLASS, GLASS])
