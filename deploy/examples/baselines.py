@@ -284,12 +284,9 @@ def tell_apart(rows: Sequence[dict[str, Any]], out: Path) -> None:
         names = dict.fromkeys(row["name"] for row in rows if row["level"] == level and row["metric"] in TOLD_APART)
         if PLATE not in names:
             continue
-        items = {
-            name: items_of(pq.read_table(folder_of(out, name, level) / f"score{level}" / ITEMS_FILE)) for name in names
-        }
-        verdicts = compare_all(items, {name: summarise(items[name]) for name in names}, TOLD_APART)
+        items = {name: pq.read_table(folder_of(out, name, level) / f"score{level}" / ITEMS_FILE) for name in names}
         words = dict[tuple[str, str], str]()
-        for verdict in verdicts:
+        for verdict in compare_all(items, TOLD_APART):
             a, b, better = verdict["a"], verdict["b"], verdict["better"]
             if better and PLATE in (a, b):
                 words[b if a == PLATE else a, verdict["metric"]] = "worse" if better == PLATE else "better"

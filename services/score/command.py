@@ -36,6 +36,7 @@ from services.score.summary import (
     ITEMS_FILE,
     Figure,
     compare,
+    decide,
     items_of,
     query_of,
     summarise,
@@ -124,19 +125,19 @@ def is_whole(summary: Mapping[str, Any]) -> bool:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    """Prints which of two scores is better by each metric, with a paired interval."""
-    (a, one), (b, other) = (read_score(options.out, path) for path in options.compare)
-    require_alike(options.out, str(options.compare[0]), one, str(options.compare[1]), other)
-    metrics = compare(a, b)
-    better = {"a": f"{options.compare[0]} is better", "b": f"{options.compare[1]} is better", None: "not decided"}
-    for name, row in metrics.items():
-        if name not in HEADLINES:
-            continue
+    """Prints which of two scores is surely better by each metric, and by how much."""
+    a, b = map(str, options.compare)
+    (one, head), (other, its_head) = (read_score(options.out, path) for path in options.compare)
+    require_alike(options.out, a, head, b, its_head)
+    metrics = compare(one, other, HEADLINES)
+    decide(metrics.values())
+    better = {"a": f"{a} is better", "b": f"{b} is better", None: "not decided"}
+    for name, row in ((name, row) for name, row in metrics.items() if name in HEADLINES):
         verdict = better[row["better"]] if row["coverage"] == 1.0 else f"no verdict below full {covered(row)}"
         print(
             f"{name:28}{in_words(name, row['a']):>12}{in_words(name, row['b']):>12}  b - a: {interval(name, row):28}{verdict}"
         )
-    return finish(options, True, a=str(options.compare[0]), b=str(options.compare[1]), metrics=metrics)
+    return finish(options, True, a=a, b=b, metrics=metrics)
 
 
 def require_alike(out: str, a: str, one: Mapping[str, Any], b: str, other: Mapping[str, Any]) -> None:
@@ -333,9 +334,10 @@ def _group(title: str, groups: Mapping[str, Mapping[str, Figure]], columns: Sequ
 
 
 def _charts(table: pa.Table) -> str:
-    figures = []
+    every = [name for _, columns in _CHARTS for name in columns.values() if name in table.column_names]
+    figures, of_name = [], values_of(table, every)
     for title, columns in _CHARTS:
-        values = {word: values_of(table, name) for word, name in columns.items() if name in table.column_names}
+        values = {word: of_name[name] for word, name in columns.items() if name in of_name}
         known = np.concatenate([*(one[np.isfinite(one)] for one in values.values()), np.empty(0)])
         if len(known):
             top = float(known.max()) or 1.0

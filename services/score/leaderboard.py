@@ -1,22 +1,17 @@
 """Edge: `verso score merge` makes one table of several scores, and says who is surely better than whom.
 
-Runs are compared scene by scene: Wilcoxon's signed-rank test of the means over a scene's items, with Holm's correction over all
-pairs of runs and metrics (Demsar 2006, sections 3.1.3 and 3.2.2). A run that leaves anything out is in the table, and is not
-compared.
+A run that leaves anything out is in the table, and is not compared.
 """
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from scipy.stats import wilcoxon
 
-from schemas.base import Array
 from schemas.errors import InputError
 from services.run.progress import finish
 from services.score.command import (
@@ -30,10 +25,7 @@ from services.score.command import (
     words,
     write_text,
 )
-from services.score.summary import Figure, is_better_high, items_of, scenes_of, summarise, values_of
-
-LEVEL: Final = 0.05
-"""Of the whole family of comparisons."""
+from services.score.summary import LEVEL, Figure, compare, decide, summarise
 
 
 def main(options: argparse.Namespace) -> int:
@@ -46,7 +38,7 @@ def main(options: argparse.Namespace) -> int:
         require_alike(options.out, first, head, name, other)
     summaries = {name: summarise(table) for name, (table, _) in scores.items()}
     metrics = [name for name in SHOWN if any(_figure(summary, name) for summary in summaries.values())]
-    verdicts = compare_all({name: items_of(table) for name, (table, _) in scores.items()}, summaries, metrics)
+    verdicts = compare_all({name: table for name, (table, _) in scores.items()})
     options.target.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.Table.from_pylist([*_rows(summaries, metrics)]), options.target / "leaderboard.parquet")
     tables, sentences = [*_markdown(summaries, metrics)], describe_verdicts(verdicts, summaries)
@@ -77,47 +69,16 @@ def _figure(summary: Mapping[str, Any], name: str) -> Figure | None:
     return figure if figure and figure["items"] else None
 
 
-def compare_all(
-    tables: Mapping[str, pa.Table], summaries: Mapping[str, Any], metrics: Sequence[str]
-) -> list[dict[str, Any]]:
+def compare_all(tables: Mapping[str, pa.Table], metrics: Sequence[str] = SHOWN) -> list[dict[str, Any]]:
     """Each pair of whole runs by each metric: `metric`, `a`, `b`, `p` by Holm, and the `better`, None where that is not sure."""
-    verdicts: list[dict[str, Any]] = []
-    for metric in metrics:
-        whole = [
-            name
-            for name, summary in summaries.items()
-            if (figure := _figure(summary, metric)) and figure["coverage"] == 1.0
-        ]
-        means = {name: scene_means(tables[name], metric) for name in whole}
-        for a, b in combinations(whole, 2):
-            difference = means[b] - means[a]
-            difference = difference[np.isfinite(difference)]
-            p = float(wilcoxon(difference).pvalue) if difference.any() else 1.0
-            better = b if (difference.mean() > 0.0) == is_better_high(metric) else a
-            verdicts.append({"metric": metric, "a": a, "b": b, "p": p, "better": better})
-    corrected = holm([verdict["p"] for verdict in verdicts])
+    pairs = {(a, b): compare(tables[a], tables[b], metrics) for a, b in combinations(tables, 2)}
+    decide([row for rows in pairs.values() for row in rows.values()])
     return [
-        {**verdict, "p": p, "better": verdict["better"] if p < LEVEL else None}
-        for verdict, p in zip(verdicts, corrected, strict=True)
+        {"metric": metric, "a": a, "b": b, "p": row["p"], "better": {"a": a, "b": b}.get(row["better"])}
+        for metric in metrics
+        for (a, b), rows in pairs.items()
+        if (row := rows.get(metric)) and row["p"] is not None
     ]
-
-
-def scene_means(table: pa.Table, metric: str) -> Array:
-    """[S] the mean over the items of each scene, by the order of scenes; nan of one without any."""
-    values, scenes = values_of(table, metric), scenes_of(table)
-    known = np.isfinite(values)
-    sums, counts = (np.bincount(scenes[known], weights, scenes.max() + 1) for weights in (values[known], None))
-    with np.errstate(invalid="ignore"):
-        return np.asarray(sums / counts)
-
-
-def holm(values: Sequence[float]) -> list[float]:
-    """p-values corrected for their number (Holm 1979): the smallest times all, the next times one less, none below one before."""
-    order, corrected, last = np.argsort(values, kind="stable"), [0.0] * len(values), 0.0
-    for rank, place in enumerate(order):
-        last = max(last, min(1.0, values[place] * (len(values) - rank)))
-        corrected[place] = last
-    return corrected
 
 
 def describe_verdicts(verdicts: Sequence[Mapping[str, Any]], summaries: Mapping[str, Any]) -> str:

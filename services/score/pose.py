@@ -14,7 +14,7 @@ from trimesh.triangles import closest_point
 from schemas.base import Array, Pose
 from schemas.errors import InputError
 from schemas.scene.shape import Mesh
-from workers.geometry.frames import angle_between, transform
+from workers.geometry.frames import angle_between, pose, transform
 
 ROTATION = 1e-3
 """How far the products of a rotation's rows may be from 0 and 1: csv files of poses have as few as four digits."""
@@ -78,10 +78,8 @@ def symmetries_of(mesh: Mesh) -> list[Pose]:
     some, limit = vertices[:: -(-len(vertices) // LOOKED_AT)], SAME * float(np.linalg.norm(high - low))
 
     def turn(axis: int, degrees: float) -> Pose:
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_rotvec(np.eye(3)[axis] * degrees, degrees=True).as_matrix()
-        T[:3, 3] = middle - T[:3, :3] @ middle
-        return T
+        R = Rotation.from_rotvec(np.eye(3)[axis] * degrees, degrees=True).as_matrix()
+        return pose(R, middle - R @ middle)
 
     def same(axis: int, degrees: float) -> bool:
         return is_near(transform(turn(axis, degrees), some), corners, limit)

@@ -31,6 +31,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh
 from schemas.scene.view import DRAWN_ROLES, Role
 from services.score.pose import is_rigid
 from workers.door.opening import as_refusal, read_bytes
+from workers.geometry.frames import pose
 from workers.store.images import decode_png
 
 SUFFIXES: Final = {
@@ -249,8 +250,7 @@ def read_pose(text: str) -> Pose:
     """[4, 4] object to camera, metres, of R (nine numbers, row-wise) and t (millimetres). Raises InputError."""
     try:
         R, t = (np.array(part.split(), np.float64) for part in text.split("|")[1:])
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R.reshape(3, 3), t.reshape(3) / 1e3
+        T = pose(R.reshape(3, 3), t.reshape(3) / 1e3)
     except ValueError as error:
         raise InputError(f"the pose is not nine numbers R and three numbers t: {plain_line(text)}") from error
     if not is_rigid(T):

@@ -1,4 +1,4 @@
-"""What the items say together: means with intervals, and two predictions compared. Pure.
+"""What the items say together: means with intervals, and who is surely better than whom. Pure.
 
 A mean is over all items of a kind whose truth has something to predict: what is missing, refused or left out counts as worst, and
 no value counts as worse than that. Worst is 0 for likenesses and shares of good points; for errors of depth the end of the depths
@@ -10,6 +10,7 @@ unit. Intervals are 95 % of the bootstrap over scenes, because the items of a sc
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any, Final
 
 import duckdb
@@ -83,9 +84,9 @@ def items_of(table: pa.Table) -> pa.Table:
     return table.filter(pc.is_in(table["status"], pa.array(["ok", "missing", "refused"])))
 
 
-def values_of(table: pa.Table, name: str) -> Array:
-    """[N] float64: the metric of every item as it counts, nan where it does not."""
-    return _counted(table, [name])[0][:, 0]
+def values_of(table: pa.Table, names: Sequence[str]) -> dict[str, Array]:
+    """By metric [N] float64: of every item as it counts, nan where it does not."""
+    return dict(zip(names, _counted(table, names)[0].T, strict=True))
 
 
 @dataclass(frozen=True)
@@ -278,33 +279,62 @@ def _figure(value: float, means: Array, items: int, scenes: int) -> Figure:
     return {"value": float(value) if items else None, **ends, "items": items}
 
 
-def compare(a: pa.Table, b: pa.Table) -> dict[str, Any]:
-    """By metric of kinds that both predict: `a`, `b`, `difference` b - a with its paired interval over all items, the `better`.
+def compare(a: pa.Table, b: pa.Table, tested: Collection[str]) -> dict[str, dict[str, Any]]:
+    """By metric of kinds that both predict: `a`, `b`, and their `difference` b - a with its paired interval over all items.
 
-    None is the better where either leaves anything out: `coverage` is the lesser of the two. Raises InputError where the two
-    have other items.
+    `p` is that of Wilcoxon's signed-rank test of the means over a scene's items; None of a metric that is not `tested`, and where
+    either leaves anything out: `coverage` is the lesser of the two. `better` is a or b, for `decide` to take away. Raises
+    InputError where the two have other items.
     """
     tables = [items_of(each).sort_by([(name, "ascending") for name in ITEM]) for each in (a, b)]
     kinds = pa.array(sorted(set.intersection(*(set(each["kind"].to_pylist()) for each in tables))), pa.string())
     a, b = (each.filter(pc.is_in(each["kind"], kinds)) for each in tables)
     if a.select(ITEM) != b.select(ITEM):
         raise InputError("the two scores are not of the same items: score both with the same --split")
-    scenes, answer = scenes_of(a), dict[str, Any]()
-    for name in sorted({*metrics_of(a)} & {*metrics_of(b)}, key=metrics_of(a).index):
-        (mine, _, covered), (theirs, _, also_covered) = (
-            [column[:, 0] for column in _counted(each, [name])] for each in (a, b)
-        )
-        one, other, apart = figures(np.column_stack([mine, theirs, theirs - mine]), scenes)
-        if apart["value"] is None:
-            continue
-        coverage = min(_mean(covered) or 0.0, _mean(also_covered) or 0.0)
-        better, low, high = None, apart["low"], apart["high"]
-        if coverage == 1.0 and low is not None and high is not None and (low > 0.0 or high < 0.0):
-            better = "b" if (low > 0.0) == is_better_high(name) else "a"
-        answer[name] = {"a": one["value"], "b": other["value"], "difference": apart["value"]} | {
-            "low": low, "high": high, "items": apart["items"], "coverage": coverage, "better": better
-        }  # fmt: skip
+    scenes, answer = scenes_of(a), dict[str, dict[str, Any]]()
+    names = [name for name in metrics_of(a) if name in metrics_of(b)]
+    (mine, _, covered), (theirs, _, also_covered) = (_counted(each, names) for each in (a, b))
+    for place, (name, apart) in enumerate(zip(names, figures(theirs - mine, scenes), strict=True)):
+        if apart["value"] is not None:
+            one, other, *shares = (_mean(each[:, place]) or 0.0 for each in (mine, theirs, covered, also_covered))
+            p = _wilcoxon((theirs - mine)[:, place], scenes) if name in tested and min(shares) == 1.0 else None
+            better = "b" if (other > one) == is_better_high(name) else "a"
+            answer[name] = {
+                "a": one,
+                "b": other,
+                "difference": apart["value"],
+                "low": apart["low"],
+                "high": apart["high"],
+            }
+            answer[name] |= {"items": apart["items"], "coverage": min(shares), "p": p, "better": better}
     return answer
+
+
+LEVEL: Final = 0.05
+"""Of the whole family of comparisons."""
+
+
+def decide(rows: Collection[dict[str, Any]]) -> None:
+    """Corrects the p of the rows of `compare` for their number (Holm 1979), and takes the `better` away where that is not sure.
+
+    Over all metrics and pairs of predictions that are told together (Demsar 2006, sections 3.1.3 and 3.2.2).
+    """
+    tested = sorted((row for row in rows if row["p"] is not None), key=itemgetter("p"))
+    last = 0.0
+    for rank, row in enumerate(tested):
+        row["p"] = last = max(last, min(1.0, row["p"] * (len(tested) - rank)))
+    for row in rows:
+        row["better"] = row["better"] if row["p"] is not None and row["p"] < LEVEL else None
+
+
+def _wilcoxon(differences: Array, scenes: NDArray[np.int64]) -> float:
+    """The p-value of the means over the items [N] of each scene; 1 where none differs."""
+    from scipy.stats import wilcoxon  # takes half a second, which a score need not wait for
+
+    known = np.isfinite(differences)
+    there, at = np.unique(scenes[known], return_inverse=True)
+    means = np.bincount(at, differences[known], len(there)) / np.bincount(at, minlength=len(there))
+    return float(wilcoxon(means).pvalue) if means.any() else 1.0
 
 
 def _equal(table: pa.Table, name: str, word: str) -> NDArray[np.bool_]:
