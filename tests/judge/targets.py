@@ -38,9 +38,7 @@ def stored_pairs(context: WorkerContext, scene: Scene) -> Iterator[StoredPair]:
 def pairs_of(job: Job, output: SceneOutput) -> Iterator[StoredPair]:
     """The pairs of what a scene or a capture leaves."""
     files, keys = {file.path: file.data for file in output.files}, job.model_dump(mode="json")
-    stored = StoredRange(
-        output.scene_id, output.scene_id + 1, (), {key: list(rows) for key, rows in output.rows.items()}
-    )
+    stored = StoredRange(output.scene_id, output.scene_id + 1, (), output.rows)
     for views, objects in stored.pairs(output.scene_id):
         yield StoredPair(keys, output.rows["scenes"][0], views, objects, files.__getitem__, stored_kinds(job))
 
