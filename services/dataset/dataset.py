@@ -207,7 +207,7 @@ class Dataset:
     def _pairs(self, where: pc.Expression | None, part: tuple[int, int]) -> Iterator[Pair]:
         for number, records in enumerate(iter_committed(self._store)):
             if number % part[1] == part[0]:
-                yield from pairs_of(*self._open_range(records), where)
+                yield from pairs_of(*self.open_range(records), where)
 
     def pair(self, pose_id: int) -> Pair:
         """The pair with this id of its input view or of its mirror view. Raises InputError where it is not stored."""
@@ -225,11 +225,11 @@ class Dataset:
         if scenes is None:
             records = find_records(self._store, scene_id)
             scenes = range(records[0].span.start, records[0].span.stop)
-            self._kept[scenes] = self._open_range(records)
+            self._kept[scenes] = self.open_range(records)
         rows, files = self._kept[scenes]
         return tuple(pairs_of(rows.of_scene(scene_id), files))
 
-    def _open_range(self, records: Sequence[CommitRecord]) -> "tuple[RangeRows, RangeFiles]":
+    def open_range(self, records: Sequence[CommitRecord]) -> "tuple[RangeRows, RangeFiles]":
         """The rows and files of a committed range."""
         return RangeRows.of(lambda table: range_rows(self._store, records, table)), RangeFiles(self._files, records)
 

@@ -32,7 +32,7 @@ class Shapes:
 
         Raises InputError where it is neither stored nor to be had from the job's sources, CorruptError where it is damaged.
         """
-        return self._kept(region_names(scene)[region], scene["scene_id"]).copy()
+        return self._kept(region_names(scene)[region]).copy()
 
     def samples(self, scene: Mapping[str, Any], region: int) -> Mapping[str, NDArray]:
         """The stored samples of the same shape by name, own frame, metres; none where none are stored.
@@ -51,12 +51,12 @@ class Shapes:
 
         return Sources(self._record)
 
-    def _load(self, name: tuple[str, str], scene_id: int) -> "trimesh.Trimesh":
+    def _load(self, name: tuple[str, str]) -> "trimesh.Trimesh":
         import trimesh
 
         from services.read.scene_geometry import read_meshes
 
-        meshes = [mesh for _, mesh in read_meshes(self._read, self._sources, scene_id, name)]
+        meshes = [mesh for _, mesh in read_meshes(self._read, self._sources, name)]
         joined = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
         assert isinstance(joined, trimesh.Trimesh)
         return joined
@@ -81,5 +81,7 @@ class RangeFiles:
 
     def __init__(self, files: StoredFiles, records: Sequence[CommitRecord]) -> None:
         self.patch, self.mesh, self.samples = files.patch, files.shapes.mesh, files.shapes.samples
-        self.image = file_reader(committed_reader(files.store, records), records, files.tars)
-        """The bytes of an image, published or not yet. Raises CorruptError where it is missing."""
+        self.read = committed_reader(files.store, records)
+        """The bytes of a file that is not in a tar, published or not yet. Raises CorruptError where it is missing."""
+        self.image = file_reader(self.read, records, files.tars)
+        """The same of an image."""

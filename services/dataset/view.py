@@ -118,17 +118,20 @@ class Pixels:
         return self._paths
 
     def image(self, kind: PixelKind) -> NDArray:
-        """The pixels of an image of any kind in `images`, as they are stored.
+        """The pixels of an image of any kind in `images`, as they are stored. Raises as `png`, and for damage."""
+        return decode_png(self.png(kind), self._paths[kind])
 
-        Raises InputError where the dataset has no such image, CorruptError where it is damaged.
+    def png(self, kind: PixelKind) -> bytes:
+        """The file of an image of any kind in `images`.
+
+        Raises InputError where the dataset has no such image, CorruptError where it is missing.
         """
         if kind not in self._paths:
             target = MODALITIES[kind].target if kind in MODALITIES and "region" in self._paths else None
             others = "" if not target or MODALITIES[kind].of_input else ", of views beside the input's"
             hint = f": a job stores it whose targets.views names {target}{others}" if target else ""
             raise InputError(f"this view has no image of kind {kind!r}, only {', '.join(self._paths) or 'none'}{hint}")
-        path = self._paths[kind]
-        return decode_png(self._files.image(path), path)
+        return self._files.image(self._paths[kind])
 
     def rgb(self) -> NDArray[np.uint8]:
         """[H, W, 3] uint8 sRGB; where alpha is stored, colours that it does not darken."""
@@ -276,6 +279,11 @@ class View(Pixels):
     objects: tuple[ObjectLabel, ...] = field(repr=False)
     """Labels of the table (region 2) and of every object; the projected view has the mirror view's."""
     row: Mapping[str, Any] = field(repr=False)
+
+    @property
+    def name(self) -> str:
+        """What it is called within its pair: its role, of a named camera with its number."""
+        return view_name(self.role, self.number)
 
     def patch(self, region: int = REGION_FIRST_OBJECT) -> Pixels | None:
         """The stored crop about an object; None where it would leave the image, or where the object is not seen."""

@@ -12,23 +12,34 @@ mirror z of coordinates and models, because theirs were drawn in a left-handed f
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from schemas.dataset.codec import Row
 from schemas.dataset.layout import PixelKind
 from schemas.errors import plural
 from schemas.job.assets import BUILT_IN
 from schemas.scene.shape import REGION_FIRST_OBJECT, is_object
 from schemas.scene.view import Role
+from services.dataset.pair import Pair
+from services.dataset.view import View
 from services.export.formats import Writer
-from services.export.source import MM_PER_M, ExportPair, ExportScene, in_units
+from services.export.source import (
+    MM_PER_M,
+    ExportScene,
+    all_drawn,
+    depth_of,
+    drawn,
+    in_units,
+    labels_of,
+    lacks_colour,
+    png_of,
+)
 from services.merge.tables import escaped
-from workers.store.images import decode_png, encode_png
+from workers.store.images import encode_png
 
 UNITS_PER_M = 5000.0
 """Of every depth image."""
@@ -46,7 +57,7 @@ class MirrorRecon(Writer):
     """The next even id by category; objects `with` all their patches and those `without`."""
     HEADS: ClassVar = {_PAIRS: "category,id,scene_id,pose_id\n"}
 
-    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+    def take(self, scene: ExportScene, pair: Pair) -> str:
         """Writes a pair that is whole."""
         images, reason = _images_of(pair)
         if reason:
@@ -59,15 +70,17 @@ class MirrorRecon(Writer):
         self.count("objects", "with", len(scene.instances) - len(reasons))
         return ""
 
-    def _write(self, scene: ExportScene, pair: ExportPair, images: dict[str, bytes]) -> None:
+    def _write(self, scene: ExportScene, pair: Pair, images: dict[str, bytes]) -> None:
         even = self.kept["next"].get(scene.category, 0)
         self.count("next", scene.category, 2)
         for name, data in images.items():
             self.folder.put(f"{scene.category}/{name.format(even=even, odd=even + 1)}.png", data)
         for role, more, _ in _VIEWS:
-            lines = "".join(_object_line(row) for row in pair.labels(role))
-            self.folder.put(f"{scene.category}/objects{even + more:05d}.dat", lines.encode())
-            self.folder.append(f"{scene.category}/{_CAM_POSES}", _pose_line(even, more, pair.views[role]).encode())
+            view = pair.views[role]
+            self.folder.put(
+                f"{scene.category}/objects{even + more:05d}.dat", "".join(map(_object_line, labels_of(view))).encode()
+            )
+            self.folder.append(f"{scene.category}/{_CAM_POSES}", _pose_line(even, more, view.row).encode())
         self.folder.append_row(_PAIRS, (scene.category, even, scene.scene_id, pair.pose_id))
 
     def describe(self) -> dict[str, Any]:
@@ -88,54 +101,53 @@ Images = dict[str, bytes]
 """PNG bytes by name without ending, with places for the ids `even` and `odd`."""
 
 
-def _patches_of(pair: ExportPair, regions: list[int]) -> tuple[Images, list[str]]:
+def _patches_of(pair: Pair, regions: list[int]) -> tuple[Images, list[str]]:
     """(the patches of every object that has all of them, the reason of each other one)."""
     patches: Images = {}
     reasons = []
     for number, region in enumerate(regions):
-        images, reason = _images_of(pair, (region, len(regions)), f"obj{number}")
+        images, reason = _images_of(pair, region, f"obj{number}")
         if reason:
             reasons.append(reason)
             continue
-        distance = _distance_patch(pair, region, images[f"rgbIn{{even:05d}}yaw0obj{number}"])
-        patches |= images | {f"distIn{{even:05d}}yaw0obj{number}": encode_png(distance)}
+        patches |= images | {f"distIn{{even:05d}}yaw0obj{number}": encode_png(_distance_patch(pair.input, region))}
     return patches, reasons
 
 
-def _images_of(pair: ExportPair, patch: tuple[int, int] | None = None, place: str = "") -> tuple[Images, str]:
-    """(images by name, the reason why one is not there): of whole views, or patches of (region, objects), called `place`."""
+def _images_of(pair: Pair, region: int | None = None, place: str = "") -> tuple[Images, str]:
+    """(images by name, the reason why one is not there): of whole views, or patches of a region, called `place`."""
     images: Images = {}
     for role, number, word in (*_VIEWS, ("projected", 0, "yaw-179")):
-        middle = "Proj" if role == "projected" else "In" if patch else ""
-        ending = f"{{{'even' if patch or not number else 'odd'}:05d}}{word + place if patch else ''}"
+        if (view := pair.views.get(role)) is None:
+            return {}, f"no {role} view"
+        shown = view if region is None else view.patch(region)
+        middle = "Proj" if role == "projected" else "In" if region else ""
+        ending = f"{{{'even' if region or not number else 'odd'}:05d}}{word + place if region else ''}"
         for kind, name in _KINDS if role != "projected" else _KINDS[:2]:
-            data = pair.patch(role, kind, *patch) if patch else pair.image(role, kind)
-            if data is None:
-                what = "patch" if patch else kind
-                return {}, f"no {role} view" if role not in pair.views else f"no {what} of the {role} view"
-            in_depth = in_units(data, pair.views[role]["depth_units_per_m"], UNITS_PER_M) if kind == "depth" else data
+            if (data := png_of(shown, kind)) is None:
+                return {}, f"no {'patch' if region else kind} of the {role} view"
+            in_depth = in_units(data, view.depth_units_per_m, UNITS_PER_M) if kind == "depth" else data
             images[f"{name}{middle}{ending}"] = in_depth
     return images, ""
 
 
-def _distance_patch(pair: ExportPair, region_id: int, patch: bytes) -> NDArray[np.uint16]:
+def _distance_patch(view: View, region_id: int) -> NDArray[np.uint16]:
     """[h, w] distance in pixels, rounded, of each pixel of an input patch to the nearest pixel of its object."""
-    region = pair.pixels("input", "region")
-    assert region is not None
-    height, width = decode_png(patch).shape[:2]
-    (label,) = (row for row in pair.labels("input") if row["region_id"] == region_id)
-    top, left = label["v"] - height // 2, label["u"] - width // 2
-    distance = distance_transform_edt(region != region_id)[top : top + height, left : left + width]
+    label, patch = view.regions[region_id], view.patch(region_id)
+    assert patch is not None
+    k, distance = patch.camera.intrinsics, distance_transform_edt(view.segment() != region_id)
+    top, left = label["v"] - k.height // 2, label["u"] - k.width // 2
+    distance = distance[top : top + k.height, left : left + k.width]
     return np.rint(distance).astype(np.uint16)
 
 
-def _pose_line(even: int, more: int, view: Row) -> str:
+def _pose_line(even: int, more: int, view: Mapping[str, Any]) -> str:
     """`id parent pitch yaw m00 ... m33`."""
     numbers = [view["inclination_rad"], view["yaw_rad"], *view["T_world_cam"]]
     return " ".join([str(even + more), str(even), *map(repr, numbers)]) + "\n"
 
 
-def _object_line(row: Row) -> str:
+def _object_line(row: Mapping[str, Any]) -> str:
     """`category instance region cx cy T00 ... T33`; white space in names is written as in a URL."""
     words = [escaped(row["category"]), escaped(row["instance_id"]), row["region_id"], row["u"], row["v"]]
     return " ".join([*map(str, words), *map(repr, row["T_cam_obj"])]) + "\n"
@@ -162,12 +174,12 @@ class Nocs(Writer):
 
     NEEDS: ClassVar = {"views": ("coordinates",)}
 
-    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+    def take(self, scene: ExportScene, pair: Pair) -> str:
         """Writes the pair's images, where all have colour."""
-        if reason := pair.lacks_colour():
+        if reason := lacks_colour(all_drawn(pair)):
             return reason
-        for role in pair.drawn:
-            self._write(scene, pair, role)
+        for view in drawn(pair):
+            self._write(scene, view)
         return ""
 
     def end_scene(self, scene: ExportScene) -> None:
@@ -175,25 +187,26 @@ class Nocs(Writer):
         for category, instance_id in scene.instances.values():
             self._write_model(scene, category, instance_id)
 
-    def _write(self, scene: ExportScene, pair: ExportPair, role: Role) -> None:
-        number, view = self.kept["images"].get(scene.split, 0), pair.views[role]
+    def _write(self, scene: ExportScene, view: View) -> None:
+        number, region = self.kept["images"].get(scene.split, 0), view.segment()
         path = f"{scene.split}/{number // IN_FOLDER:05d}/{number % IN_FOLDER:04d}"
-        rgb, depth, region = pair.image(role, "rgb"), pair.depth(role, MM_PER_M), pair.pixels(role, "region")
-        codes = pair.pixels(role, "coordinates")
-        assert rgb is not None and depth is not None and region is not None and codes is not None
         meta, classes = "", self.kept["classes"]
         for region_id, (category, name) in scene.instances.items():
             number, own_class = region_id - REGION_FIRST_OBJECT + 1, classes.setdefault(category, len(classes) + 1)
             meta += f"{number} {own_class} {_synset(category)} {escaped(name)}\n"
-        coordinates = np.rint(codes[..., _STORED_AXES] / _STEPS).astype(np.uint8)
+        coordinates = np.rint(view.image("coordinates")[..., _STORED_AXES] / _STEPS).astype(np.uint8)
         # Objects count from 1.
         numbers = np.where(is_object(region), region - (REGION_FIRST_OBJECT - 1), BACKGROUND)
-        files = {"color.png": rgb, "coord.png": encode_png(coordinates), "depth.png": depth}
+        files = {
+            "color.png": view.png("rgb"),
+            "coord.png": encode_png(coordinates),
+            "depth.png": depth_of(view, MM_PER_M),
+        }
         files |= {"mask.png": encode_png(numbers.astype(np.uint8)), "meta.txt": meta.encode()}
         for name, data in files.items():
             self.folder.put(f"{path}_{name}", data)
-        columns = (view[name] for name in _OF_VIEWS)
-        self.folder.append_row(_IMAGES, (path, scene.scene_id, view["pose_id"], role, *columns))
+        columns = (view.row[name] for name in _OF_VIEWS)
+        self.folder.append_row(_IMAGES, (path, scene.scene_id, view.pose_id, view.role, *columns))
         self.count("images", scene.split)
 
     def _write_model(self, scene: ExportScene, category: str, instance_id: str) -> None:

@@ -19,9 +19,12 @@ from schemas.base import Array
 from schemas.dataset.codec import Row, read_matrix
 from schemas.errors import plural
 from schemas.scene.shape import REGION_FIRST_OBJECT, Part, Shape
-from schemas.scene.view import DRAWN_ROLES, Role
+from schemas.scene.view import DRAWN_ROLES
+from services.dataset.pair import Pair
+from services.dataset.view import View
 from services.export.formats import LeftOut, Writer, encode_json
 from services.export.shapes import (
+    Columns,
     Silhouette,
     box_of,
     reaches_edge,
@@ -29,9 +32,10 @@ from services.export.shapes import (
     vertex_colors,
     whole_silhouette,
 )
-from services.export.source import ExportPair, ExportScene
+from services.export.source import ExportScene, drawn, labels_of, lacks_colour
+from services.read.dataset_reader import kinds_of
 from workers.geometry.frames import invert
-from workers.store.images import decode_png, encode_mask
+from workers.store.images import encode_mask
 
 NO_SHAPE: Final = "an object is hidden in part, and its shape is neither stored nor here"
 _MM = 1000.0
@@ -43,7 +47,7 @@ class _Shot:
     """An image of a scene: its number, its row of `views`, its files by path, and what is said of each object in it."""
 
     number: int
-    view: Row
+    view: Columns
     files: dict[str, bytes]
     poses: list[Row] = field(default_factory=list)
     infos: list[Row] = field(default_factory=list)
@@ -63,12 +67,17 @@ class Bop(Writer):
         self._numbers = {region: self._number(scene, name) for region, (_, name) in scene.instances.items()}
         return super().add(scene)
 
-    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+    def take(self, scene: ExportScene, pair: Pair) -> str:
         """Writes the pair's images."""
-        shots = [self._shot(scene, pair, role) for role in pair.drawn]
-        for reason in (shot for shot in shots if isinstance(shot, str)):
+        if reason := lacks_colour(drawn(pair)):
             return reason
-        for shot in (shot for shot in shots if isinstance(shot, _Shot)):
+        # Pair k has the images 3 k, 3 k + 1 and 3 k + 2
+        first = len(DRAWN_ROLES) * scene.pairs.index(pair)
+        shots = [self._shot(scene, view, first + DRAWN_ROLES.index(view.role)) for view in drawn(pair)]
+        whole = [shot for shot in shots if shot is not None]
+        if len(whole) < len(shots):
+            return NO_SHAPE
+        for shot in whole:
             for path, data in shot.files.items():
                 (self._place / path).parent.mkdir(parents=True, exist_ok=True)
                 (self._place / path).write_bytes(data)
@@ -109,24 +118,19 @@ class Bop(Writer):
             self.kept["models"] += 1
         return number
 
-    def _shot(self, scene: ExportScene, pair: ExportPair, role: Role) -> _Shot | str:
-        """An image with its masks, or a reason why there is none."""
-        rgb, region, depth = pair.image(role, "rgb"), pair.pixels(role, "region"), pair.image(role, "depth")
-        if rgb is None or region is None or depth is None:
-            return f"no {'rgb' if rgb is None else 'labels'} of the {role} view"
-        # Pair k has the images 3 k, 3 k + 1 and 3 k + 2
-        number = len(DRAWN_ROLES) * pair.number + DRAWN_ROLES.index(role)
-        view, pixels = pair.views[role], decode_png(depth)
-        shot = _Shot(number, view, {f"rgb/{number:06d}.png": rgb, f"depth/{number:06d}.png": depth})
-        silhouettes = pair.stack(role, "amodal")
-        for label in pair.labels(role):
+    def _shot(self, scene: ExportScene, view: View, number: int) -> _Shot | None:
+        """An image with its masks; None where one of an object cannot be known."""
+        region, pixels, has_silhouettes = view.segment(), view.depth(), bool(kinds_of("amodal", view.images))
+        files = {f"{kind}/{number:06d}.png": view.png(kind) for kind in ("rgb", "depth")}
+        shot = _Shot(number, view.row, files)
+        for label in labels_of(view):
             if label["region_id"] < REGION_FIRST_OBJECT:
                 continue
             visible = region == label["region_id"]
-            stored = None if silhouettes is None else silhouettes[label["region_id"] - REGION_FIRST_OBJECT] > 0
-            whole = self._silhouette(scene, label, view, visible, stored)
+            stored = view.amodal(label["region_id"]) if has_silhouettes else None
+            whole = self._silhouette(scene, label, view.row, visible, stored)
             if whole is None:
-                return NO_SHAPE
+                return None
             name = f"{number:06d}_{len(shot.poses):06d}.png"
             shot.files[f"mask/{name}"], shot.files[f"mask_visib/{name}"] = encode_mask(whole.mask), encode_mask(visible)
             R, t = (T := read_matrix(label["T_cam_obj"]))[:3, :3], T[:3, 3]
@@ -136,7 +140,12 @@ class Bop(Writer):
         return shot
 
     def _silhouette(
-        self, scene: ExportScene, label: Row, view: Row, visible: NDArray[np.bool_], stored: NDArray[np.bool_] | None
+        self,
+        scene: ExportScene,
+        label: Columns,
+        view: Columns,
+        visible: NDArray[np.bool_],
+        stored: NDArray[np.bool_] | None,
     ) -> Silhouette | None:
         """The whole silhouette of an object of which `visible` is seen, None where it cannot be known.
 
@@ -173,7 +182,7 @@ class Bop(Writer):
         }
 
 
-def _camera(view: Row) -> Row:
+def _camera(view: Columns) -> Row:
     """An entry of scene_camera.json."""
     T_cam_world = invert(read_matrix(view["T_world_cam"]))
     return {
@@ -184,7 +193,7 @@ def _camera(view: Row) -> Row:
     }
 
 
-def _sensor(view: Row) -> dict[str, Any]:
+def _sensor(view: Columns) -> Row:
     """camera.json: the sensor of the first image."""
     names = {"width": "width", "height": "height", "fx": "fx", "fy": "fy", "cx": "cx_opencv", "cy": "cy_opencv"}
     return {**{name: view[column] for name, column in names.items()}, "depth_scale": _MM / view["depth_units_per_m"]}

@@ -4,7 +4,7 @@ import argparse
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Set
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.errors import InputError, OutputError, command_line, did_you_mean, plural
+from services.dataset.dataset import Dataset
 from services.export.folder import ExportFolder
 from services.export.formats import Choice, ExportRequest, Writer, choose_scenes
 from services.export.source import iter_records, scenes_of, splits_of
 from services.export.table import FORMATS
 from services.job.record import JobRecord, read_success, require_dataset, require_job
-from services.read.dataset_reader import read_stored
 from services.read.query import query
 from services.read.verdict import explain_damage
 from services.run.progress import ProgressLine, finish
@@ -70,7 +70,7 @@ def export(request: ExportRequest, report: Report = lambda done, asked: None) ->
             return _Export(writer, codes, begun).run(chosen, report)
 
 
-def _refuse_empty(request: ExportRequest, chosen: Collection[int]) -> None:
+def _refuse_empty(request: ExportRequest, chosen: Set[int]) -> None:
     """Raises InputError where no object has a category that is named, or no scene is chosen: before anything is written."""
     store, choice = request.store, request.choice
     for option, names, table in (
@@ -99,7 +99,7 @@ class _Export:
         if begun["writer"] is None:
             self._folder.append(LEFT_OUT, b"scene_id,pose_id,reason\n")
 
-    def run(self, chosen: Collection[int], report: Report) -> ExportResult:
+    def run(self, chosen: Set[int], report: Report) -> ExportResult:
         """Every chosen scene from the checkpoint on, then the manifest."""
         before = self._counts["pairs"]
         if not self._finished:
@@ -120,16 +120,15 @@ class _Export:
         self._folder.finish(manifest)
         return ExportResult(manifest, self._counts["pairs"] - before)
 
-    def _write_scenes(self, chosen: Collection[int], report: Report) -> None:
+    def _write_scenes(self, chosen: Set[int], report: Report) -> None:
         store, job, choice = self._writer.request.store, self._writer.record.job, self._writer.request.choice
         splits = splits_of(store, self._codes, job.assets.split, choice.held_out, choice.split == "category")
+        dataset = Dataset(store)
         for records in iter_records(store, self._codes):
-            if records[0].span.stop <= self._next_scene:
+            first, stop = max(self._next_scene, records[0].span.start), records[0].span.stop
+            if stop <= first:
                 continue
-            stored = read_stored(store, records)
-            made = (row["scene_id"] for row in stored.rows["scenes"])
-            here = [scene_id for scene_id in made if scene_id in chosen and scene_id >= self._next_scene]
-            for scene in scenes_of(store, stored, here, splits):
+            for scene in scenes_of(dataset, records, chosen & set(range(first, stop)), splits):
                 left_out = self._writer.add(scene)
                 pairs = len(scene.pairs) - len(left_out)
                 self._counts.update(scenes=int(pairs > 0), pairs=pairs, pairs_left_out=len(left_out))
@@ -137,8 +136,8 @@ class _Export:
                 for pose_id, reason in left_out:
                     self._folder.append_row(LEFT_OUT, (scene.scene_id, pose_id, reason))
                 self._checkpoint(scene.scene_id + 1)
-            self._checkpoint(max(self._next_scene, stored.stop))
-            report(stored.stop, job.stop_scene)
+            self._checkpoint(max(self._next_scene, stop))
+            report(stop, job.stop_scene)
 
     def _checkpoint(self, next_scene: int) -> None:
         self._next_scene = next_scene

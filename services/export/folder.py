@@ -52,17 +52,17 @@ class ExportFolder:
             message = f"{self.root} holds {', '.join(names[:3])}{' and more' if len(names) > 3 else ''}"
             raise OutputError(f"{message}: an export goes into a new or an empty folder, choose another DIR")
         with alone_in(self.root, f"{WORK}/{_LOCK}", "verso export"):
+            shutil.rmtree(self.work / _TEMPORARY, ignore_errors=True)
+            (self.work / _TEMPORARY).mkdir()
             known = _read_tree(self.work / _PLAN)
             if known is None:
-                self._write_work(_PLAN, plan)
+                self.put(f"{WORK}/{_PLAN}", json.dumps(plan).encode())
             else:
                 # A run that went on may have finished the dataset: the export is of what was there at first.
                 self.refuse_other(known, {**plan, "dataset_digest": known.get("dataset_digest")})
             self.plan = known or plan
             progress = _read_tree(self.work / _PROGRESS)
             self._cut_parts({} if progress is None else progress["parts"])
-            shutil.rmtree(self.work / _TEMPORARY, ignore_errors=True)
-            (self.work / _TEMPORARY).mkdir()
             yield progress
 
     def refuse_other(self, known: Tree, plan: Tree) -> None:
@@ -113,7 +113,7 @@ class ExportFolder:
             with open(part, "ab") as file:
                 file.write(b"".join(pieces))
         self._waiting = {}
-        self._write_work(_PROGRESS, {**progress, "parts": self._sizes})
+        self.put(f"{WORK}/{_PROGRESS}", json.dumps({**progress, "parts": self._sizes}).encode())
 
     def finish(self, manifest: Tree) -> None:
         """Gives every growing file its name, writes the manifest, and clears away the rest. After a checkpoint alone."""
@@ -139,11 +139,6 @@ class ExportFolder:
 
     def _part(self, path: str) -> Path:
         return self.work / _PARTS / urllib.parse.quote(path, safe="")
-
-    def _write_work(self, name: str, tree: Tree) -> None:
-        temporary = self.work / f"{name}.new"
-        temporary.write_text(json.dumps(tree))
-        os.replace(temporary, self.work / name)
 
 
 def _read_tree(path: Path) -> Tree | None:

@@ -18,9 +18,10 @@ from schemas.base import Frozen
 from schemas.dataset.layout import MAX_SCENE, asset_path
 from schemas.errors import CorruptError, InputError
 from schemas.job.job import Job
+from services.dataset.pair import Pair
 from services.export.folder import ExportFolder, Register
 from services.export.shapes import Shapes
-from services.export.source import ExportPair, ExportScene
+from services.export.source import ExportScene
 from services.job.record import JobRecord
 from services.read.query import query
 from services.read.scene_geometry import Sources
@@ -123,7 +124,7 @@ class Writer:
             self.end_scene(scene)
         return left_out
 
-    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+    def take(self, scene: ExportScene, pair: Pair) -> str:
         """Writes a pair; why it is left out, or nothing."""
         raise NotImplementedError
 
@@ -162,12 +163,12 @@ class ObjectWriter(Writer):
 
     FRESH: ClassVar = {"views": {}}
 
-    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+    def take(self, scene: ExportScene, pair: Pair) -> str:
         """Takes every object; a pair of which nothing is taken is left out."""
         reasons = [self.take_object(scene, pair, region_id) for region_id in scene.instances]
         return reasons[0] if all(reasons) else ""
 
-    def take_object(self, scene: ExportScene, pair: ExportPair, region_id: int) -> str:
+    def take_object(self, scene: ExportScene, pair: Pair, region_id: int) -> str:
         """Writes the views of an object in a pair; why there are none, or nothing."""
         raise NotImplementedError
 

@@ -11,13 +11,14 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from schemas.dataset.codec import Row, read_matrix, read_world_poses
-from schemas.dataset.layout import view_name
+from schemas.dataset.codec import Row, read_world_poses
 from schemas.errors import CorruptError, SceneError, VersoError
 from schemas.scene.shape import is_object
 from schemas.scene.view import DRAWN_ROLES, Role
+from services.dataset.pair import Pair
+from services.dataset.view import View
 from services.export.formats import LeftOut, Writer, encode_json
-from services.export.source import MM_PER_M, SIDES, ExportPair, ExportScene
+from services.export.source import MM_PER_M, SIDES, ExportScene, all_drawn, depth_of, lacks_colour
 from services.read.scene_geometry import pose_shapes
 from workers.assets.glb import join_glb
 from workers.door.opening import split_glb
@@ -39,13 +40,13 @@ class Gltf(Writer):
     def add(self, scene: ExportScene) -> LeftOut:
         """Writes the scene's file."""
         try:
-            posed = pose_shapes(self.request.store, scene.stored, scene.row, self.record, self.sources)
+            posed = pose_shapes(self.request.store.read, scene.row, scene.assets.values(), self.sources)
         except CorruptError:
             raise
         except (VersoError, OSError) as error:
             reason = f"its shapes cannot be made again: {error.reason}" if isinstance(error, SceneError) else NO_SOURCES
             return [(pair.pose_id, reason) for pair in scene.pairs]
-        views = [pair.views[role] for pair in scene.pairs for role in pair.all_drawn]
+        views = [view for pair in scene.pairs for view in all_drawn(pair)]
         seen = with_cameras(posed.export(file_type="glb"), views)
         self.folder.put(f"{scene.category}/{scene.scene_id:06d}.glb", seen)
         self.count("files", scene.category)
@@ -61,17 +62,17 @@ class Gltf(Writer):
         }
 
 
-def with_cameras(glb: bytes, views: list[Row]) -> bytes:
-    """A GLB file with a camera for each row of `views`, and a root node that turns the world's z up to glTF's y."""
+def with_cameras(glb: bytes, views: list[View]) -> bytes:
+    """A GLB file with a camera for each view, and a root node that turns the world's z up to glTF's y."""
     tree, binary = split_glb(glb)
     nodes, cameras = tree["nodes"], tree.setdefault("cameras", [])
     roots = list(tree["scenes"][0]["nodes"])
     for view in views:
-        matrix = read_matrix(view["T_world_cam"]) @ OPENGL_FROM_OPTICAL
-        name = f"{view_name(view['role'], view['number'])} {view['pose_id']}"
+        matrix, k = view.T_world_cam @ OPENGL_FROM_OPTICAL, view.camera.intrinsics
+        name = f"{view.name} {view.pose_id}"
         roots.append(len(nodes))
         nodes.append({"name": name, "camera": len(cameras), "matrix": matrix.T.ravel().tolist()})
-        width, height = view["width"] / view["fx"], view["height"] / view["fy"]
+        width, height = k.width / k.fx, k.height / k.fy
         lens = {"yfov": 2.0 * math.atan(0.5 * height), "aspectRatio": width / height, "znear": _NEAR_M}
         cameras.append({"name": name, "type": "perspective", "perspective": lens})
     tree["scenes"][0]["nodes"] = [len(nodes)]
@@ -94,12 +95,12 @@ class Nerf(Writer):
         self._frames: dict[Role, list[Row]] = {role: [] for role in DRAWN_ROLES}
         return super().add(scene)
 
-    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+    def take(self, scene: ExportScene, pair: Pair) -> str:
         """Writes the pair's views, where all have colour."""
-        if reason := pair.lacks_colour():
+        if reason := lacks_colour(all_drawn(pair)):
             return reason
-        for name in pair.all_drawn:
-            self._frames.setdefault(pair.views[name]["role"], []).append(self._write(pair, name))
+        for view in all_drawn(pair):
+            self._frames.setdefault(view.role, []).append(self._write(view))
         return ""
 
     def end_scene(self, scene: ExportScene) -> None:
@@ -118,18 +119,16 @@ class Nerf(Writer):
         lens = self.record.job.sensor.distortion
         return {} if lens is None else lens.model_dump()
 
-    def _write(self, pair: ExportPair, role: Role) -> Row:
+    def _write(self, view: View) -> Row:
         """The frame of a view whose files are written; depth and masks, which are a pinhole camera's, without distortion."""
-        view, name = pair.views[role], f"{pair.views[role]['parent_id']:05d}_{role}.png"
-        rgb, depth, region = pair.image(role, "rgb"), pair.depth(role, MM_PER_M), pair.pixels(role, "region")
-        assert rgb is not None and depth is not None and region is not None
-        files = {"images": rgb, "depths": depth, "masks": encode_mask(is_object(region))}
+        name, mask = f"{view.row['parent_id']:05d}_{view.name}.png", encode_mask(is_object(view.segment()))
+        files = {"images": view.png("rgb"), "depths": depth_of(view, MM_PER_M), "masks": mask}
         keys = {"images": ("file_path",), "depths": ("depth_file_path", "depth_path"), "masks": ("mask_path",)}
         kinds = ["images"] if self._lens else list(files)
         for kind in kinds:
             self.folder.put(f"{self._folder}/{kind}/{name}", files[kind])
-        matrix = read_matrix(view["T_world_cam"]) @ OPENGL_FROM_OPTICAL
-        sizes = {key: view[column] for key, column in _SIZES.items()}
+        matrix = view.T_world_cam @ OPENGL_FROM_OPTICAL
+        sizes = {key: view.row[column] for key, column in _SIZES.items()}
         paths = {key: f"{kind}/{name}" for kind in kinds for key in keys[kind]}
         return {**paths, **sizes, "transform_matrix": matrix.tolist()}
 

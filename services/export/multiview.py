@@ -11,6 +11,7 @@ side of that box is `SIDE`; cameras look along -z with y up (OpenGL), as Blender
 import csv
 import io
 import math
+from collections.abc import Mapping
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -19,24 +20,22 @@ from numpy.typing import NDArray
 from trimesh.exchange.ply import export_ply
 
 from schemas.base import Array
-from schemas.dataset.codec import Row, read_matrix, read_world_poses
-from schemas.dataset.layout import view_name
+from schemas.dataset.codec import read_world_poses
 from schemas.errors import InputError
 from schemas.job.cameras import More
 from schemas.job.job import Job
+from services.dataset.pair import Pair
+from services.dataset.view import View
 from services.export.formats import LeftOut, Writer, encode_json, encode_npy, encode_npz
 from services.export.graphics import OPENGL_FROM_OPTICAL
 from services.export.objects import NO_SHAPE
-from services.export.source import ExportPair, ExportScene
+from services.export.source import ExportScene, alone, drawn, lacks_colour, named
 from workers.geometry.frames import invert, transform
 from workers.store.images import encode_png
 
 NOT_SQUARE: Final = (
     "a view is not a square picture with the optical axis in its middle, which these loaders take for granted"
 )
-
-Seen = tuple[ExportPair, str]
-"""A pair, and the name of one of its views."""
 
 
 class Subject(NamedTuple):
@@ -73,11 +72,9 @@ class MultiView(Writer):
     def add(self, scene: ExportScene) -> LeftOut:
         """Writes a folder for each object; a scene with a view that the layout cannot hold is left out."""
         standing = {entry.name for entry in self.record.job.cameras.more if entry.beside is None}
-        named = [(pair, name) for pair in scene.pairs for name in pair.named if pair.views[name]["role"] in standing]
-        views = named or [(pair, role) for pair in scene.pairs for role in pair.drawn]
-        colourless = (pair.lacks_colour(name) for pair, name in views)
-        reason = next(filter(None, colourless), "") or next((NOT_SQUARE for view in views if not is_square(view)), "")
-        if reason:
+        around = [view for pair in scene.pairs for view in named(pair) if view.role in standing]
+        views = around or [view for pair in scene.pairs for view in drawn(pair)]
+        if reason := lacks_colour(views) or (not all(map(is_square, views)) and NOT_SQUARE):
             return [(pair.pose_id, reason) for pair in scene.pairs]
         placed = ((region_id, self._place(scene, region_id)) for region_id in scene.instances)
         subjects = {region_id: subject for region_id, subject in placed if subject is not None}
@@ -90,7 +87,7 @@ class MultiView(Writer):
             self.register.add(scene.split, name)
             self.count("objects", scene.split)
         self.kept["views"] = sorted({*self.kept["views"], len(views)})
-        fovs = (round(math.degrees(field_of_view(pair.views[name])), 4) for pair, name in views)
+        fovs = (round(math.degrees(field_of_view(view)), 4) for view in views)
         self.kept["fov_deg"] = sorted({*self.kept["fov_deg"], *fovs})
         return []
 
@@ -103,29 +100,24 @@ class MultiView(Writer):
         unit, origin = self.SIDE / float((high - low).max()), 0.5 * (low + high)
         return Subject(region_id, unit, origin, unit * (points - origin), shape.faces)
 
-    def write(self, scene: ExportScene, name: str, views: list[Seen]) -> None:
+    def write(self, scene: ExportScene, name: str, views: list[View]) -> None:
         """Writes the folder of an object."""
         raise NotImplementedError
 
-    def colour(self, view: Seen) -> bytes:
+    def colour(self, view: View) -> bytes:
         """The RGBA of the object in a view, as PNG."""
-        pair, name = view
-        return pair.alone(name, self._subject.region_id)
+        return alone(view, self._subject.region_id)
 
-    def pose(self, view: Seen) -> Array:
+    def pose(self, view: View) -> Array:
         """[4, 4] camera to the object's frame, OpenGL."""
-        pair, name = view
-        T = read_matrix(pair.views[name]["T_world_cam"]) @ OPENGL_FROM_OPTICAL
+        T = view.T_world_cam @ OPENGL_FROM_OPTICAL
         T[:3, 3] = self._subject.unit * (T[:3, 3] - self._subject.origin)
         return T
 
-    def depth(self, view: Seen) -> NDArray[np.float64]:
+    def depth(self, view: View) -> NDArray[np.float64]:
         """[H, W] z along the optical axis in the layout's unit, 0 where the object is not seen."""
-        pair, name = view
-        depth, region = pair.pixels(name, "depth"), pair.pixels(name, "region")
-        assert depth is not None and region is not None
-        unit = self._subject.unit / pair.views[name]["depth_units_per_m"]
-        return np.where(region == self._subject.region_id, unit * depth, 0.0)
+        unit = self._subject.unit / view.depth_units_per_m
+        return np.where(view.segment() == self._subject.region_id, unit * view.depth(), 0.0)
 
     def list_of(self, split: str, names: list[str]) -> bytes:
         """What lists the folders of a split."""
@@ -147,16 +139,15 @@ class MultiView(Writer):
         }
 
 
-def is_square(seen: Seen) -> bool:
+def is_square(view: View) -> bool:
     """Whether a view is a square picture of square pixels, with the principal point in its middle."""
-    view = seen[0].views[seen[1]]
-    middle = 0.5 * view["width"]
-    return view["width"] == view["height"] and view["fx"] == view["fy"] and view["cx"] == view["cy"] == middle
+    k = view.camera.intrinsics
+    return k.width == k.height and k.fx == k.fy and k.cx == k.cy == 0.5 * k.width
 
 
-def field_of_view(view: Row) -> float:
+def field_of_view(view: View) -> float:
     """Horizontal, radians, of a view whose principal point is in the middle."""
-    return 2.0 * math.atan(0.5 * view["width"] / view["fx"])
+    return 2.0 * math.atan(0.5 * view.camera.intrinsics.width / view.camera.intrinsics.fx)
 
 
 class Zero123(MultiView):
@@ -165,7 +156,7 @@ class Zero123(MultiView):
     SIDE: ClassVar = 1.0
     LIST: ClassVar = "valid_paths.json"
 
-    def write(self, scene: ExportScene, name: str, views: list[Seen]) -> None:
+    def write(self, scene: ExportScene, name: str, views: list[View]) -> None:
         """Writes pictures and poses."""
         folder = f"{scene.split}/{name}"
         for number, view in enumerate(views):
@@ -190,7 +181,7 @@ class InstantMesh(MultiView):
     DEPTH: ClassVar = 6.0
     """The depth of 255."""
 
-    def write(self, scene: ExportScene, name: str, views: list[Seen]) -> None:
+    def write(self, scene: ExportScene, name: str, views: list[View]) -> None:
         """Writes pictures, normals and depth, and the poses."""
         folder = f"{scene.split}/rendering_random_32views/{name}"
         for number, view in enumerate(views):
@@ -201,13 +192,11 @@ class InstantMesh(MultiView):
         poses = np.stack([invert(self.pose(view))[:3] for view in views])
         self.folder.put(f"{folder}/cameras.npz", encode_npz({"cam_poses": poses}))
 
-    def _normals(self, view: Seen) -> NDArray[np.uint8]:
+    def _normals(self, view: View) -> NDArray[np.uint8]:
         """[H, W, 4] world normals as (n + 1) / 2, and where there are any."""
-        pair, name = view
-        codes, region = pair.pixels(name, "normals"), pair.pixels(name, "region")
-        assert codes is not None and region is not None
-        seen = (region == self._subject.region_id) & codes.any(axis=2)
-        normals = (codes / 32767.5 - 1.0) @ read_matrix(pair.views[name]["T_world_cam"])[:3, :3].T
+        codes = view.image("normals")
+        seen = (view.segment() == self._subject.region_id) & codes.any(axis=2)
+        normals = (codes / 32767.5 - 1.0) @ view.T_world_cam[:3, :3].T
         colours = np.where(seen[..., None], np.rint(127.5 * (normals + 1.0)), 0.0)
         return np.concatenate([colours, 255.0 * seen[..., None]], axis=2).astype(np.uint8)
 
@@ -227,26 +216,23 @@ class Trellis(MultiView):
     SIDE: ClassVar = 1.0
     LIST: ClassVar = "metadata.csv"
 
-    def write(self, scene: ExportScene, name: str, views: list[Seen]) -> None:
+    def write(self, scene: ExportScene, name: str, views: list[View]) -> None:
         """Writes both folders, and the mesh."""
         self._write_views(f"{scene.split}/renders/{name}", views, deep=True)
-        inputs = ((pair, "input") for pair in scene.pairs)
-        if conditions := list(filter(self._is_seen, inputs)):
+        if conditions := [pair.input for pair in scene.pairs if self._is_seen(pair.input)]:
             self._write_views(f"{scene.split}/renders_cond/{name}", conditions)
         mesh = trimesh.Trimesh(self._subject.points, self._subject.faces, process=False)
         self.folder.put(f"{scene.split}/renders/{name}/mesh.ply", export_ply(mesh))
 
-    def _is_seen(self, view: Seen) -> bool:
+    def _is_seen(self, view: View) -> bool:
         """Whether a loader, which cuts the object out, finds it in a view."""
-        pair, name = view
-        label = pair.label(name, self._subject.region_id)
-        return label is not None and label["pixels"] > 0 and not pair.lacks_colour(name) and is_square(view)
+        return view.regions[self._subject.region_id]["pixels"] > 0 and "rgb" in view.images and is_square(view)
 
-    def _write_views(self, folder: str, views: list[Seen], deep: bool = False) -> None:
+    def _write_views(self, folder: str, views: list[View], deep: bool = False) -> None:
         frames = []
         for number, view in enumerate(views):
             T = self.pose(view)
-            frame = {"file_path": f"{number:03d}.png", "camera_angle_x": field_of_view(view[0].views[view[1]])}
+            frame = {"file_path": f"{number:03d}.png", "camera_angle_x": field_of_view(view)}
             frame["transform_matrix"] = T.tolist()
             self.folder.put(f"{folder}/{frame['file_path']}", self.colour(view))
             if deep:
@@ -299,20 +285,17 @@ class Stereo(Writer):
                 f"{example}; this job has none: make the dataset with one"
             )
 
-    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+    def take(self, scene: ExportScene, pair: Pair) -> str:
         """Writes the folders of a pair, one for each rectified camera."""
         for entry in filter(is_rectified, self.record.job.cameras.more):
-            views = [entry.beside or "", view_name(entry.name, 0)]
-            left, right = views if entry.offset_m[0] > 0.0 else views[::-1]
-            if reason := next(filter(None, map(pair.lacks_colour, views)), ""):
+            views = [pair.views[entry.beside or ""], pair.views[entry.name, 0]]
+            if reason := lacks_colour(views):
                 return reason
             folder = f"{scene.split}/{scene.scene_id:06d}-{pair.pose_id:06d}-{entry.name}"
-            for number, name in enumerate((left, right)):
-                rgb, depth = pair.image(name, "rgb"), pair.pixels(name, "depth")
-                assert rgb is not None and depth is not None
-                self.folder.put(f"{folder}/im{number}.png", rgb)
-                self.folder.put(f"{folder}/disp{number}.pfm", encode_pfm(disparity_of(depth, pair.views[name], entry)))
-            self.folder.put(f"{folder}/calib.txt", calibration_of(pair.views[left], entry).encode())
+            for number, view in enumerate(views if entry.offset_m[0] > 0.0 else views[::-1]):
+                self.folder.put(f"{folder}/im{number}.png", view.png("rgb"))
+                self.folder.put(f"{folder}/disp{number}.pfm", encode_pfm(disparity_of(view, entry)))
+            self.folder.put(f"{folder}/calib.txt", calibration_of(views[0].row, entry).encode())
             self.count("folders", scene.split)
         return ""
 
@@ -333,9 +316,9 @@ def is_rectified(entry: More) -> bool:
     return entry.beside is not None and along_x and alike
 
 
-def disparity_of(depth: NDArray[np.uint16], view: Row, entry: More) -> NDArray[np.float32]:
+def disparity_of(view: View, entry: More) -> NDArray[np.float32]:
     """[H, W] pixels between the columns of a point in both views: f b / z of stored depth; inf where there is none."""
-    shift = view["fx"] * abs(entry.offset_m[0]) * view["depth_units_per_m"]
+    depth, shift = view.depth(), view.camera.intrinsics.fx * abs(entry.offset_m[0]) * view.depth_units_per_m
     return np.where(depth > 0, shift / np.maximum(depth, 1), np.inf).astype(np.float32)
 
 
@@ -345,9 +328,9 @@ def encode_pfm(values: NDArray[np.float32]) -> bytes:
     return f"Pf\n{width} {height}\n-1.0\n".encode() + values[::-1].astype("<f4").tobytes()
 
 
-def calibration_of(left: Row, entry: More) -> str:
-    """The text of calib.txt, of two views with one sensor."""
-    matrix = f"[{left['fx']!r} 0 {left['cx_opencv']!r}; 0 {left['fy']!r} {left['cy_opencv']!r}; 0 0 1]"
+def calibration_of(view: Mapping[str, Any], entry: More) -> str:
+    """The text of calib.txt, of two views with one sensor: the row of either."""
+    matrix = f"[{view['fx']!r} 0 {view['cx_opencv']!r}; 0 {view['fy']!r} {view['cy_opencv']!r}; 0 0 1]"
     lines = {"cam0": matrix, "cam1": matrix, "doffs": 0, "baseline": 1000.0 * abs(entry.offset_m[0])}
-    lines |= {"width": left["width"], "height": left["height"]}
+    lines |= {"width": view["width"], "height": view["height"]}
     return "".join(f"{name}={value}\n" for name, value in lines.items())

@@ -19,11 +19,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from schemas.dataset.codec import Row, read_camera, read_matrix
+from schemas.dataset.codec import Row, read_matrix
+from schemas.scene.view import Intrinsics
+from services.dataset.pair import Pair
 from services.export.formats import ObjectWriter, encode_json, encode_npz, sample_mesh
-from services.export.source import ExportPair, ExportScene
-from workers.geometry.camera import unproject
-from workers.geometry.frames import invert, transform
+from services.export.source import ExportScene, sides
 
 SIZE: Final = 137
 """Pixels of an image's side: those loaders scale camera_mat by it."""
@@ -46,7 +46,7 @@ class OccNet(ObjectWriter):
 
     NEEDS: ClassVar = {"shape": ("surface", "volume")}
 
-    def take_object(self, scene: ExportScene, pair: ExportPair, region_id: int) -> str:
+    def take_object(self, scene: ExportScene, pair: Pair, region_id: int) -> str:
         """Writes an object's crops, and its points with the first; without colour its points alone."""
         category, instance_id = scene.instances[region_id]
         split, path = scene.assets[instance_id]["split"], f"{category}/{instance_id}"
@@ -124,36 +124,36 @@ def points_of(stored: Mapping[str, NDArray]) -> dict[str, dict[str, NDArray]]:
     }
 
 
-def crops_of(pair: ExportPair, region_id: int, asset: Row) -> Iterator[tuple[bytes, dict[str, list]]]:
+def crops_of(pair: Pair, region_id: int, asset: Row) -> Iterator[tuple[bytes, dict[str, list]]]:
     """(JPEG, camera_mat and world_mat) of each view that has colour and the whole sphere about the object's box."""
-    for role in pair.sides:
-        label = pair.label(role, region_id)
-        if label is None or not label["pixels"] or (pixels := pair.pixels(role, "rgb")) is None:
+    for view in sides(pair):
+        label, k = view.regions[region_id], view.camera.intrinsics
+        if not label["pixels"] or "rgb" not in view.images:
             continue
-        T, view = read_matrix(label["T_cam_obj"]), pair.views[role]
-        window = _window(T[:3, 3], math.hypot(*asset["extents_m"]) / 2.0, view)
+        T = read_matrix(label["T_cam_obj"])
+        window = _window(T[:3, 3], math.hypot(*asset["extents_m"]) / 2.0, k)
         if window is None:
             continue
         left, top, side = window
         share = SIZE / side
         camera = [
-            [share * view["fx"], 0.0, share * (view["cx"] - left)],
-            [0.0, share * view["fy"], share * (view["cy"] - top)],
+            [share * k.fx, 0.0, share * (k.cx - left)],
+            [0.0, share * k.fy, share * (k.cy - top)],
             [0.0, 0.0, 1.0],
         ]
-        image = _encode_jpeg(pixels[top : top + side, left : left + side])
+        image = _encode_jpeg(view.rgb()[top : top + side, left : left + side])
         yield image, {"camera_mat": camera, "world_mat": T[:3].tolist()}
 
 
-def _window(centre: Array, radius_m: float, view: Row) -> tuple[int, int, int] | None:
+def _window(centre: Array, radius_m: float, k: Intrinsics) -> tuple[int, int, int] | None:
     """(left, top, side) of a square with a sphere in it, pixels; None where it leaves the image."""
     x, y, z = centre.tolist()
     if z <= radius_m:
         return None
-    side = math.ceil(2.0 * MARGIN * max(view["fx"], view["fy"]) * radius_m / math.sqrt(z * z - radius_m * radius_m))
-    left = round(view["fx"] * x / z + view["cx"] - side / 2.0)
-    top = round(view["fy"] * y / z + view["cy"] - side / 2.0)
-    inside = left >= 0 and top >= 0 and left + side <= view["width"] and top + side <= view["height"]
+    side = math.ceil(2.0 * MARGIN * max(k.fx, k.fy) * radius_m / math.sqrt(z * z - radius_m * radius_m))
+    left = round(k.fx * x / z + k.cx - side / 2.0)
+    top = round(k.fy * y / z + k.cy - side / 2.0)
+    inside = left >= 0 and top >= 0 and left + side <= k.width and top + side <= k.height
     return (left, top, side) if inside else None
 
 
@@ -184,12 +184,12 @@ class Pcn(ObjectWriter):
 
     HEADS: ClassVar = {_VIEWS: "split,category,instance_id,number,scene_id,pose_id,role,points\n"}
 
-    def take_object(self, scene: ExportScene, pair: ExportPair, region_id: int) -> str:
+    def take_object(self, scene: ExportScene, pair: Pair, region_id: int) -> str:
         """Writes what each view shows of an object, and its complete cloud with the first."""
         (category, instance_id), asset = scene.instances[region_id], scene.assets[scene.instances[region_id][1]]
         diagonal, split = math.hypot(*asset["extents_m"]), asset["split"]
-        clouds = {role: seen_points(pair, role, region_id) / diagonal for role in pair.sides}
-        clouds = {role: points for role, points in clouds.items() if len(points) >= FEWEST}
+        shown = ((view, view.cloud("object", region_id).points / diagonal) for view in sides(pair))
+        clouds = [(view, points) for view, points in shown if len(points) >= FEWEST]
         if not clouds:
             return NO_POINTS
         number = len(self.register.of(key := f"{category}/{split}/{instance_id}"))
@@ -198,11 +198,11 @@ class Pcn(ObjectWriter):
             if complete is None:
                 return NO_SHAPE
             self.folder.put(f"{split}/complete/{category}/{instance_id}.pcd", encode_pcd(complete / diagonal))
-        for place, (role, points) in enumerate(clouds.items(), start=number):
+        for place, (view, points) in enumerate(clouds, start=number):
             self.folder.put(f"{split}/partial/{category}/{instance_id}/{place:02d}.pcd", encode_pcd(points))
             self.register.add(key)
-            ids = scene.scene_id, pair.views[role]["pose_id"]
-            self.folder.append_row(_VIEWS, (split, category, instance_id, place, *ids, role, len(points)))
+            ids = scene.scene_id, view.pose_id, view.name
+            self.folder.append_row(_VIEWS, (split, category, instance_id, place, *ids, len(points)))
         self.count("views", split, len(clouds))
         return ""
 
@@ -236,18 +236,6 @@ class Pcn(ObjectWriter):
             "points": "object frame, z up, origin in the middle of the bounding box, whose diagonal is 1",
             "repeated": f"{_VIEWS} lists the clouds; objects of train with fewer have copies of them up to {RENDERINGS}",
         }
-
-
-def seen_points(pair: ExportPair, role: str, region_id: int) -> NDArray[np.float64]:
-    """[N, 3] what a view's depth shows of an object, object frame, metres; none where the view is not stored."""
-    view, label = pair.views.get(role), pair.label(role, region_id)
-    if view is None or label is None:
-        return np.zeros((0, 3))
-    depth, region = pair.pixels(role, "depth"), pair.pixels(role, "region")
-    assert depth is not None and region is not None
-    rows, columns = np.nonzero((region == region_id) & (depth > 0))
-    points = unproject(rows, columns, depth[rows, columns] / view["depth_units_per_m"], read_camera(view).intrinsics)
-    return transform(invert(read_matrix(label["T_cam_obj"])), points)
 
 
 def encode_pcd(points: NDArray) -> bytes:

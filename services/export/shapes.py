@@ -1,7 +1,8 @@
 """Shapes of a dataset's instances, and silhouettes of objects: what is seen, what others hide, what is outside the image."""
 
-import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from cachetools import LRUCache
@@ -14,11 +15,15 @@ from schemas.errors import CorruptError, VersoError
 from schemas.scene.shape import Part, Shape
 from schemas.scene.view import Intrinsics
 from services.export.source import ExportScene
+from services.read.dataset_reader import as_damage
 from services.read.independent.rays import bare_faces, cast
 from services.read.scene_geometry import Sources
 from workers.assets.glb import read_shape
 from workers.geometry.camera import NEAR_M, project_bounds
 from workers.geometry.frames import transform
+
+Columns = Mapping[str, Any]
+"""A row of `views` or `objects`."""
 
 _KEPT = 32
 """Shapes that are kept: those of a few scenes."""
@@ -46,14 +51,12 @@ class Shapes:
             data = scene.read(path)
         except CorruptError:  # it is not stored: only shapes that may be passed on are
             try:
-                asset = self._sources.asset(scene.scene_id, row["category"], row["instance_id"])
+                asset = self._sources.asset(row["category"], row["instance_id"])
             except (VersoError, OSError):
                 return None
             return asset.shape if asset.sha256 == row["sha256"] else None
-        try:
+        with as_damage(path):
             return read_shape(data)[0]
-        except (ValueError, LookupError, TypeError, OSError, struct.error) as error:
-            raise CorruptError(f"{path} cannot be read: {error}; `verso verify OUT` says what to do") from error
 
 
 def vertex_colors(part: Part) -> NDArray[np.uint8]:
@@ -100,7 +103,9 @@ def reaches_edge(mask: NDArray[np.bool_]) -> bool:
     return bool(mask[[0, -1]].any() or mask[:, [0, -1]].any())
 
 
-def whole_silhouette(label: Row, view: Row, visible: NDArray[np.bool_], shape: Shape | None) -> Silhouette | None:
+def whole_silhouette(
+    label: Columns, view: Columns, visible: NDArray[np.bool_], shape: Shape | None
+) -> Silhouette | None:
     """The silhouette of the object of `label`, of which `visible` [H, W] is seen.
 
     Nothing is cast where all of it is seen. Otherwise rays through pixel centres meet its mesh alone; None without a shape.

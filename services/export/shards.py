@@ -16,8 +16,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from schemas.dataset.codec import Row
 from schemas.dataset.layout import ARTICLE, PixelKind, stored_images, stored_roles
@@ -25,9 +27,12 @@ from schemas.dataset.tables import OF_TARGETS, SCHEMAS
 from schemas.errors import plural
 from schemas.job.assets import SPLITS
 from schemas.job.job import Job
-from schemas.scene.view import MODALITIES, ROLES, Role
+from schemas.scene.view import MODALITIES, ROLES
+from services.dataset.pair import Pair
+from services.dataset.view import View
 from services.export.formats import OF_SCENE, ShardedWriter, encode_npz
-from services.export.source import ExportPair, ExportScene
+from services.export.source import ExportScene, labels_of, png_of
+from services.read.dataset_reader import kinds_of
 
 _COLOURS: Final = tuple(name for name, kind in MODALITIES.items() if (kind.channels, kind.dtype) == (3, "uint8"))
 """Modalities that are stored as PNG files; those of numbers are arrays."""
@@ -47,7 +52,7 @@ class WebDataset(ShardedWriter):
         """A tar."""
         return _Tar(path)
 
-    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+    def take(self, scene: ExportScene, pair: Pair) -> str:
         """Writes a sample."""
         for name, data in members_of(scene, pair):
             self.shard(scene.split).add(f"{pair.pose_id:09d}.{name}", data)
@@ -60,36 +65,42 @@ class WebDataset(ShardedWriter):
         return {**counts, **self.conventions("uint16")}
 
 
-def members_of(scene: ExportScene, pair: ExportPair) -> list[tuple[str, bytes]]:
+def members_of(scene: ExportScene, pair: Pair) -> list[tuple[str, bytes]]:
     """(name behind the key, bytes) of every member of a sample, in order."""
     members: list[tuple[str, bytes]] = []
     for kind, modality in MODALITIES.items():
         if kind in _COLOURS:
-            images = {name: pair.image(name, kind) for name in pair.names}
-            members += [(f"{role}.{kind}.png", data) for role, data in images.items() if data is not None]
+            members += [
+                (f"{name}.{kind}.png", view.png(kind)) for name, view in pair.views.items() if kind in view.images
+            ]
         else:
-            read = pair.stack if modality.each else pair.pixels
-            arrays = {name: array for name in pair.names if (array := read(name, kind)) is not None}
+            arrays = {name: array for name, view in pair.views.items() if (array := _array(view, kind)) is not None}
             if arrays or modality.target is None:
                 members.append((f"{kind}.npz", encode_npz(arrays)))
     return [*members, ("json", _json(scene, pair))]
 
 
-def _json(scene: ExportScene, pair: ExportPair) -> bytes:
+def _array(view: View, kind: PixelKind) -> NDArray | None:
+    """The pixels of a kind of image, [objects, H, W] of one that each object has; None where there is none."""
+    images = [view.image(each) for each in kinds_of(kind, view.images)]
+    return None if not images else np.stack(images) if MODALITIES[kind].each else images[0]
+
+
+def _json(scene: ExportScene, pair: Pair) -> bytes:
     """The rows of a pair, without what is stored elsewhere in the sample."""
     tree: Row = {name: scene.row[name] for name in _OF_SCENE}
     tree |= {"split": scene.split, "pose_id": pair.pose_id, "views": {}}
-    for name in pair.names:
-        labels = [_label(row) for row in pair.labels(name)]
-        columns = {key: value for key, value in pair.views[name].items() if key not in _NOT_OF_VIEWS}
-        tree["views"][name] = {**columns, "objects": labels}
+    for name, view in pair.views.items():
+        columns = {key: value for key, value in view.row.items() if key not in _NOT_OF_VIEWS}
+        tree["views"][name] = {**columns, "objects": list(map(_label, labels_of(view)))}
     return json.dumps(tree).encode()
 
 
-def _label(row: Row) -> Row:
+def _label(row: Mapping[str, Any]) -> Row:
     """A row of `objects` without what is stored elsewhere in the sample, and without columns of targets that are not there."""
     absent = [name for name in OF_TARGETS["objects"] if row[name] is None]
-    return {name: value for name, value in row.items() if name not in (*_NOT_OF_OBJECTS, "role", "number", *absent)}
+    left_out = (*_NOT_OF_OBJECTS, "role", "number", "asset", *absent)
+    return {name: value for name, value in row.items() if name not in left_out}
 
 
 class _Tar:
@@ -139,7 +150,7 @@ class HuggingFace(ShardedWriter):
         """A Parquet file."""
         return _Parquet(path, self._schema)
 
-    def take(self, scene: ExportScene, pair: ExportPair) -> str:
+    def take(self, scene: ExportScene, pair: Pair) -> str:
         """Writes the row of a pair."""
         self.shard(SPLIT_NAMES[scene.split]).add(row_of(self._schema, scene, pair))
         self.count("rows", SPLIT_NAMES[scene.split])
@@ -194,26 +205,30 @@ def _type_of(kind: PixelKind) -> pa.DataType:
     return IMAGES if modality.each else IMAGE
 
 
-def row_of(schema: pa.Schema, scene: ExportScene, pair: ExportPair) -> Row:
+def row_of(schema: pa.Schema, scene: ExportScene, pair: Pair) -> Row:
     """The row of a pair."""
     row: Row = {name: scene.row[name] for name in OF_SCENE}
-    row |= {"split": SPLIT_NAMES[scene.split], "pose_id": pair.pose_id, "objects": list(pair.objects)}
+    labels = (dict(row) for view in pair.views.values() for row in labels_of(view))
+    objects = sorted(labels, key=lambda row: (row["pose_id"], row["role"], row["number"] or 0, row["region_id"]))
+    row |= {"split": SPLIT_NAMES[scene.split], "pose_id": pair.pose_id, "objects": objects}
     for name in schema.names:
         role, _, kind = name.partition("_")
         if kind != "view" and kind not in MODALITIES:
             continue
-        views = [role] if role in ROLES else [each for each in pair.named if pair.views[each]["role"] == role]
-        cells = [pair.views.get(each) if kind == "view" else _cell(pair, each, kind) for each in views]
-        row[name] = cells[0] if role in ROLES else cells
+        cells = [_cell(pair, view, kind) for view in pair.views.values() if view.role == role]
+        row[name] = next(iter(cells), None) if role in ROLES else cells
     return row
 
 
-def _cell(pair: ExportPair, role: Role, kind: PixelKind) -> Any:
-    """What a view has in the column of an image, or in its place of the column's list."""
-    name, of = f"{pair.pose_id:09d}.{role}.{kind}", _type_of(kind)
+def _cell(pair: Pair, view: View, kind: PixelKind) -> Any:
+    """What a view has in the column of its row (`view`) or of an image, or in its place of the column's list."""
+    if kind == "view":
+        return dict(view.row)
+    name, of = f"{pair.pose_id:09d}.{view.name}.{kind}", _type_of(kind)
     if of == IMAGES:
-        return [{"bytes": data, "path": f"{name}{n}.png"} for n, data in enumerate(pair.images(role, kind))]
-    data = pair.image(role, kind)
+        files = map(view.png, kinds_of(kind, view.images))
+        return [{"bytes": data, "path": f"{name}{n}.png"} for n, data in enumerate(files)]
+    data = png_of(view, kind)
     return data if data is None or of == pa.binary() else {"bytes": data, "path": f"{name}.png"}
 
 

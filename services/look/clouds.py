@@ -64,7 +64,7 @@ class Body:
     """A mesh of the scene."""
 
     kind: str
-    """`object` or `table`."""
+    """`object`, or `table` for what stands around it."""
     vertices: Array
     """[V, 3] metres, world."""
     faces: NDArray[np.int64]
@@ -131,7 +131,7 @@ def _evenly(indices: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 
 
 def _read_bodies(store: Store, scene_id: int) -> tuple[tuple[Body, ...], str]:
-    """(the meshes of a scene but for the floor, a sentence why there are none)."""
+    """(the meshes of a scene but for floor and walls, a sentence why there are none)."""
     try:
         scene = posed_scene(store, scene_id)
     except VersoError as error:
@@ -140,9 +140,9 @@ def _read_bodies(store: Store, scene_id: int) -> tuple[tuple[Body, ...], str]:
     for node in scene.graph.nodes_geometry:
         T, name = scene.graph[node]
         mesh = scene.geometry[name]
-        if node.split("/")[0] == "floor" or not len(mesh.faces):
+        if node.startswith(("floor/", "walls/")) or not len(mesh.faces):
             continue
-        kind = "table" if node.startswith(("table ", "board ")) else "object"
+        kind = "table" if node.startswith(("table ", "board ", "clutter ")) else "object"
         vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
         bodies.append(coarsen(Body(kind, vertices, np.asarray(mesh.faces, np.int64))))
     return tuple(bodies), ""

@@ -7,7 +7,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import count, cycle, takewhile
+from itertools import cycle
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,10 @@ from trimesh.visual.color import interpolate
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, is_object
 from schemas.scene.view import MODALITIES, PixelKind
 from services.dataset.dataset import Dataset
-from services.dataset.pair import Pair
+from services.dataset.pair import NamedViews, Pair
 from services.dataset.view import Pixels
-from services.dataset.views import NamedViews
 from services.look.charts import DEPTH_M, Histogram
-from services.read.dataset_reader import StoredTables
+from services.read.dataset_reader import StoredTables, kinds_of
 from services.read.query import query
 from workers.geometry.camera import spread_evenly
 from workers.store.store import Store
@@ -323,7 +322,9 @@ def view_pictures(
     Depths of one series have the same span of colours.
     """
     there = {
-        kind: [shrink(each, width) for each in pixels] for kind in MODALITIES if (pixels := _images_of(kind, images))
+        kind: [shrink(images[name], width) for name in names]
+        for kind in MODALITIES
+        if (names := kinds_of(kind, images))
     }
     pictures = {}
     for kinds in series_of(there).values():
@@ -336,12 +337,6 @@ def view_pictures(
                 words = f"{words}, {ABOUT}" if len(there) > 1 else ABOUT
             pictures[f"{role} {kind}{suffix}"] = _paint(kind, there, units_per_m, span, f"{role} view, {words}")
     return pictures
-
-
-def _images_of(kind: PixelKind, images: Mapping[PixelKind, NDArray]) -> list[NDArray]:
-    """The image of a modality, or those of each object; none where there is none."""
-    each = takewhile(images.__contains__, (f"{kind}{n}" for n in count()))
-    return [images[name] for name in ([kind] if kind in images else each)]
 
 
 def _span_of(

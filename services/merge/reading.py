@@ -7,12 +7,14 @@ it gives up with a limit of 64 MiB, and at 400,000 rows of views with 128 MiB.
 
 import contextlib
 import json
+import os
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -91,14 +93,9 @@ def stored_sizes(store: Store, folder: Path) -> Iterator[Callable[[str], int | N
     if store.at_once == 1:
         yield store.size
         return
-    with contextlib.closing(
-        open_scratch(folder / "listed.sqlite", "CREATE TABLE files (path PRIMARY KEY, bytes)")
-    ) as db:
-        entries = ((entry.key, entry.bytes) for entry in store.files(""))
-        db.executemany("INSERT OR REPLACE INTO files VALUES (?, ?)", entries)
-        yield lambda path: next(
-            (size for (size,) in db.execute("SELECT bytes FROM files WHERE path = ?", (path,))), None
-        )
+    with contextlib.closing(PathTable(folder / "listed.sqlite")) as listed:
+        listed.add_all((entry.key, entry.bytes) for entry in store.files(""))
+        yield listed.get
 
 
 def check_published(read: RangeRows, size_of: Callable[[str], int | None]) -> None:
@@ -148,6 +145,31 @@ def open_scratch(path: Path, tables: str) -> sqlite3.Connection:
         connection.close()
         raise
     return connection
+
+
+class PathTable:
+    """What is known of paths, given in any order; on the disk, in constant memory. Raises sqlite3's errors."""
+
+    def __init__(self, file: Path) -> None:
+        self._db = open_scratch(file, "CREATE TABLE paths (path BLOB PRIMARY KEY, known) WITHOUT ROWID")
+
+    def add_all(self, entries: Iterable[tuple[str, object]]) -> None:
+        """Takes paths with what is known of them; what is known of one already stays."""
+        rows = ((os.fsencode(path), known) for path, known in entries)
+        self._db.executemany("INSERT INTO paths VALUES (?, ?) ON CONFLICT DO NOTHING", rows)
+
+    def add_paths(self, paths: Iterable[str]) -> None:
+        """Takes paths of which nothing is known."""
+        self.add_all((path, "") for path in paths)
+
+    def get(self, path: str) -> Any:
+        """What is known of a path, None of one that was not given."""
+        row = self._db.execute("SELECT known FROM paths WHERE path = ?", (os.fsencode(path),)).fetchone()
+        return row[0] if row else None
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._db.close()
 
 
 _TABLES = """

@@ -7,7 +7,7 @@ import io
 import itertools
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping, MutableMapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import groupby
@@ -87,16 +87,13 @@ def read_stored(store: Store, records: Sequence[CommitRecord]) -> StoredRange:
 def choose_scenes(store: Store, count: int, seed: int) -> list[int]:
     """`count` of the scenes that were made, or all of them, evenly over their ids; the seed sets the first."""
     ledger = list_commits(store)
-    ranges, failed = ledger.ranges, ledger.failures.column("scene_id").to_numpy()
-    before = np.append(0, np.cumsum(ranges[:, 1] - ranges[:, 0]))
-    at = np.searchsorted(ranges[:, 0], failed, side="right") - 1
-    made_before = before[at] + failed - ranges[at, 0] - np.arange(len(failed))  # [F] of each scene that failed
-    total = int(before[-1]) - len(failed)
-    first = float(np.random.default_rng(seed).random())
-    steps = ((np.arange(count) + first) * total / count).astype(np.int64) if count < total else np.arange(total)
-    place = steps + np.searchsorted(made_before, steps, side="right")
-    at = np.searchsorted(before, place, side="right") - 1
-    return [int(scene) for scene in ranges[at, 0] + place - before[at]]
+    sizes = ledger.ranges[:, 1] - ledger.ranges[:, 0]
+    scenes = np.arange(sizes.sum()) + np.repeat(ledger.ranges[:, 0] - np.cumsum(sizes) + sizes, sizes)
+    made = np.setdiff1d(scenes, ledger.failures.column("scene_id").to_numpy(), assume_unique=True)
+    if count < len(made):
+        first = float(np.random.default_rng(seed).random())
+        made = made[((np.arange(count) + first) * len(made) / count).astype(np.int64)]
+    return [int(scene) for scene in made]
 
 
 def find_scene(store: Store, scene_id: int) -> StoredRange:
@@ -185,16 +182,23 @@ def decode_samples(data: bytes, name: str) -> dict[str, NDArray]:
     Raises CorruptError where it is damaged or another file. Nothing is unpacked of one that would unpack to more bytes than
     it has: arrays are stored uncompressed.
     """
-    try:
+    with as_damage(name):
         with zipfile.ZipFile(io.BytesIO(data)) as file:
             if (unpacked := sum(member.file_size for member in file.infolist())) > len(data):
                 raise ValueError(f"its {len(data):,} bytes would unpack to {unpacked:,}")
         with np.load(io.BytesIO(data), allow_pickle=False) as file:
             arrays = dict(file)
         _check_samples(arrays)
-    except Exception as error:  # zipfile and numpy raise errors of many kinds for a damaged file
-        raise CorruptError(f"{name} cannot be read: {error}; `verso verify OUT` says what to do") from error
     return arrays
+
+
+@contextmanager
+def as_damage(path: str) -> Iterator[None]:
+    """Around the decoding of a stored file: what libraries raise, errors of many kinds, is CorruptError that names the file."""
+    try:
+        yield
+    except Exception as error:
+        raise CorruptError(f"{path} cannot be read: {error}; `verso verify OUT` says what to do") from error
 
 
 def _check_samples(arrays: Mapping[str, NDArray]) -> None:
@@ -230,6 +234,12 @@ def view_paths(row: Mapping[str, Any]) -> Mapping[PixelKind, str]:
             each = (path_of(n) for n in itertools.count())
             named |= {f"{kind}{n}": path for n, path in enumerate(itertools.takewhile(listed.__contains__, each))}
     return _those(named, listed)
+
+
+def kinds_of(modality: PixelKind, there: Collection[PixelKind]) -> list[PixelKind]:
+    """A modality's images among those that are there: itself, or `amodal0`, `amodal1` of one that each object has; or none."""
+    each = itertools.takewhile(there.__contains__, (f"{modality}{n}" for n in itertools.count()))
+    return [modality] if modality in there else list(each)
 
 
 def patch_paths(row: Mapping[str, Any], index: int | None) -> Mapping[PixelKind, str]:

@@ -1,21 +1,22 @@
 """The shapes of a dataset's objects, stored or from the job's sources, and the posed geometry of a stored scene or capture."""
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import trimesh
 from trimesh.visual import ColorVisuals
 
-from schemas.dataset.codec import Row, read_world_poses
+from schemas.dataset.codec import Row, read_matrix, read_world_poses
 from schemas.dataset.layout import asset_path
 from schemas.errors import CorruptError, InputError, MachineError, VersoError, needs_making
+from schemas.job.assets import TABLE
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, REGION_TABLE, Asset
 from services.job.record import JobRecord, require_job
-from services.read.dataset_reader import StoredRange, find_scene, region_names
+from services.read.dataset_reader import as_damage, find_scene, region_names
 from workers.assets.glb import linear_bytes, mesh_of_part, show_colors
 from workers.store.store import Store
 
@@ -34,36 +35,28 @@ class Sources:
     """Makes or reads again the shapes that are not in the dataset. Needs what makes data."""
 
     def __init__(self, record: JobRecord) -> None:
-        self._record = record
+        self.record = record
 
-    def asset(self, scene_id: int, category: str, instance_id: str) -> Asset:
-        """An object, or the table, of a scene of the job.
+    def asset(self, category: str, instance_id: str) -> Asset:
+        """An object, or a table, of the job.
 
         Raises CorruptError for a capture, which has no other source; InputError where the sources cannot be read here,
         MachineError where they have changed or what makes data is not installed, SceneError where the mesh is refused.
         """
         path = asset_path(category, instance_id)
-        if self._record.job.captures is not None:
+        if self.record.job.captures is not None:
             raise CorruptError(f"{path} is missing: `verso verify OUT` says what to do")
         missing = f"{path} is not in the dataset (its licence is not free, or assets.copy_assets is off), and"
         with needs_making(missing):
             from workers.assets.catalogue import load_asset
-            from workers.scene.chance import SceneChance
-            from workers.scene.draw.plan import choose_assets
             from workers.scene.draw.studio import scaled_to
         try:
             catalogue = self.catalogue
         except InputError as error:
             raise InputError(f"{missing} its source cannot be read here: {error}") from error
-        objects, table = choose_assets(self._record.job, catalogue, SceneChance(self._record.job.seed, scene_id))
-        ref = next(
-            (one for one in (*objects, table) if (one.category, one.instance_id) == (category, instance_id)), None
-        )
-        if ref is None:
-            raise CorruptError(
-                f"scene {scene_id} of the job has no {category} {instance_id}: restore job.yaml from a copy"
-            )
-        asset, job = load_asset(catalogue, ref), self._record.job
+        if (ref := catalogue.find(instance_id, category == TABLE)) is None:
+            raise CorruptError(f"the job has no {category} {instance_id}: restore job.yaml from a copy")
+        asset, job = load_asset(catalogue, ref), self.record.job
         return scaled_to(asset, job.studio) if job.scene == "studio" else asset
 
     @property
@@ -77,7 +70,7 @@ class Sources:
     def _opened(self) -> "Catalogue | VersoError | OSError":
         """The job's catalogue, or why it cannot be used: found once, because every file of the sources is read for it."""
         try:
-            return open_recorded(self._record)
+            return open_recorded(self.record)
         except (VersoError, OSError) as error:
             return error
 
@@ -95,18 +88,15 @@ def open_recorded(record: JobRecord) -> "Catalogue":
 
 def load_glb(data: bytes, path: str) -> Mapping[str, trimesh.Trimesh]:
     """The parts of a stored shape by name, object frame, metres. Raises CorruptError where it is damaged."""
-    try:
-        meshes: Mapping[str, trimesh.Trimesh] = trimesh.load_scene(
-            io.BytesIO(data), file_type="glb", process=False
-        ).geometry
-        if not meshes:
+    with as_damage(path):
+        scene: Any = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
+        if not scene.geometry:
             raise ValueError("it has no mesh")
-        return meshes
-    except Exception as error:  # trimesh raises errors of many kinds for a damaged file
-        raise CorruptError(f"{path} cannot be read: {error}; `verso verify OUT` says what to do") from error
+    meshes: Mapping[str, trimesh.Trimesh] = scene.geometry
+    return meshes
 
 
-def read_meshes(read: ReadShape, sources: Sources, scene_id: int, name: tuple[str, str]) -> list[Named]:
+def read_meshes(read: ReadShape, sources: Sources, name: tuple[str, str]) -> list[Named]:
     """The parts of the shape called (category, instance id), object frame, metres; colours are linear, as glTF has them.
 
     Raises CorruptError where the stored shape is damaged, and as `Sources.asset` where none is stored.
@@ -115,7 +105,7 @@ def read_meshes(read: ReadShape, sources: Sources, scene_id: int, name: tuple[st
     try:
         data = read(path)
     except FileNotFoundError:
-        return [(part.name, mesh_of_part(part)) for part in sources.asset(scene_id, *name).shape.parts]
+        return [(part.name, mesh_of_part(part)) for part in sources.asset(*name).shape.parts]
     # A part gives its name to its material; trimesh names a mesh by the object.
     named = [
         (getattr(getattr(mesh.visual, "material", None), "name", None) or key, mesh)
@@ -125,7 +115,7 @@ def read_meshes(read: ReadShape, sources: Sources, scene_id: int, name: tuple[st
 
 
 def posed_scene(store: Store, scene_id: int) -> trimesh.Scene:
-    """Floor, table or board, as far as there are, and objects where the stored rows put them.
+    """Floor, walls, table or board and clutter, as far as there are, and objects where the stored rows put them.
 
     Raises InputError where the scene was not made.
     """
@@ -134,24 +124,31 @@ def posed_scene(store: Store, scene_id: int) -> trimesh.Scene:
     if row is None:
         reason = next((f["reason"] for f in stored.rows["failures"] if f["scene_id"] == scene_id), "unknown")
         raise InputError(f"scene {scene_id} was not made ({reason}): it has no geometry")
-    return pose_shapes(store, stored, row, record, Sources(record))
+    return pose_shapes(store.read, row, stored.rows["assets"], Sources(record))
 
 
-def pose_shapes(store: Store, stored: StoredRange, row: Row, record: JobRecord, sources: Sources) -> trimesh.Scene:
-    """The same for a row of `scenes`: world frame, z up, metres. Raises as `read_meshes`.
+def pose_shapes(read: ReadShape, row: Mapping[str, Any], assets: Iterable[Row], sources: Sources) -> trimesh.Scene:
+    """The same for a row of `scenes` and the rows of `assets`: world frame, z up, metres. Raises as `read_meshes`.
 
-    The floor is drawn again, its look being in no file; where what makes data is not installed there is none.
+    Floor and walls are drawn again, being in no file; where what makes data is not installed there are none.
     """
     T_world, names, scene = {REGION_FLOOR: np.eye(4), **read_world_poses(row)}, region_names(row), trimesh.Scene()
+    several = len(T_world) > 3
     placed: list[tuple[str, int, list[Named]]] = []
-    if record.job.captures is not None:
-        placed.append((f"board {names.pop(REGION_TABLE)[1]}", REGION_TABLE, [("board", _board(stored, row))]))
+    for piece in (row["surroundings"] or {}).get("clutter") or ():
+        of = piece["category"], piece["instance_id"]
+        T_world[piece["region_id"]] = read_matrix(piece["T_world_obj"])
+        placed.append(
+            (f"clutter {' '.join(of)} {piece['region_id']}", piece["region_id"], read_meshes(read, sources, of))
+        )
+    if sources.record.job.captures is not None:
+        placed.append((f"board {names.pop(REGION_TABLE)[1]}", REGION_TABLE, [("board", _board(assets, row))]))
     elif REGION_TABLE in names:
-        placed.append(("floor", REGION_FLOOR, _floor(record, sources, row["scene_id"])))
+        placed += [(name, REGION_FLOOR, parts) for name, parts in _ground(sources, row["scene_id"]).items()]
     for region_id, of in names.items():
         # Two objects may be of one instance: only the region id tells them apart.
-        region = f" {region_id}" if len(T_world) > 3 and region_id >= REGION_FIRST_OBJECT else ""
-        placed.append((f"{' '.join(of)}{region}", region_id, read_meshes(store.read, sources, row["scene_id"], of)))
+        region = f" {region_id}" if several and region_id >= REGION_FIRST_OBJECT else ""
+        placed.append((f"{' '.join(of)}{region}", region_id, read_meshes(read, sources, of)))
     for label, region_id, meshes in placed:
         for number, (name, mesh) in enumerate(meshes):
             part = f"{label}/{number}-{name}"
@@ -159,23 +156,38 @@ def pose_shapes(store: Store, stored: StoredRange, row: Row, record: JobRecord, 
     return scene
 
 
-def _floor(record: JobRecord, sources: Sources, scene_id: int) -> list[Named]:
+def _ground(sources: Sources, scene_id: int) -> dict[str, list[Named]]:
+    """The parts of `floor` and, in a room, of `walls`, world frame."""
     try:
         with needs_making("the floor"):
             from workers.assets.look.appearance import draw_appearance
+            from workers.assets.look.environment import relight
+            from workers.assets.look.lights import draw_environment, draw_lights
+            from workers.assets.look.surroundings import build_room
             from workers.scene.chance import SceneChance, Stream
-            from workers.scene.draw.surround import lay_floor
+            from workers.scene.draw.surround import ROOM, lay_floor
     except MachineError:
-        return []
-    chance, look = SceneChance(record.job.seed, scene_id), record.job.drawn_look
-    floor, _ = draw_appearance(chance.stream(Stream.APPEARANCE), record.job.render.tier)
+        return {}
+    job = sources.record.job
+    chance, look = SceneChance(job.seed, scene_id), job.drawn_look
+    floor, appearance = draw_appearance(chance.stream(Stream.APPEARANCE), job.render.tier)
     floor = floor if look.floor is None else lay_floor(look.floor, sources.catalogue, chance, floor)[0]
-    return [(part.name, mesh_of_part(part)) for part in floor.parts]
+    shapes = {"floor": floor}
+    if look.room is not None:  # whose window is where the light comes from
+        lights = None if look.lights is None else draw_lights(chance.stream(Stream.LIGHTS), look.lights)
+        if (around := look.environment) is None:
+            lit = relight(appearance, lights, None, True)
+        else:
+            map_of = draw_environment(chance.stream(Stream.ENVIRONMENT), around, sources.catalogue.maps)
+            lit = relight(appearance, lights, map_of, True)
+        walls = build_room(look.room, lit.lights[0].direction, chance.stream(Stream.SURROUNDINGS, ROOM))
+        shapes["walls"] = walls.shape
+    return {name: [(part.name, mesh_of_part(part)) for part in shape.parts] for name, shape in shapes.items()}
 
 
-def _board(stored: StoredRange, row: Row) -> trimesh.Trimesh:
+def _board(assets: Iterable[Row], row: Mapping[str, Any]) -> trimesh.Trimesh:
     """The rectangle of a capture's board, its frame, metres."""
-    board = next(asset for asset in stored.rows["assets"] if asset["instance_id"] == row["table_id"])
+    board = next(asset for asset in assets if asset["instance_id"] == row["table_id"])
     x, y, _ = (0.5 * size for size in board["extents_m"])
     corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]
     mesh = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)

@@ -1,17 +1,14 @@
-"""The result of `verso verify`, errors of damaged files in one line, and every path that commits name."""
+"""The result of `verso verify`, and errors of damaged files in one line."""
 
 import contextlib
-import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 import pyarrow as pa
 
 from schemas.dataset.layout import SUCCESS_FILE, commit_path
 from schemas.errors import CorruptError, command_line
-from services.merge.reading import open_scratch
 from workers.store.store import Store
 
 MOST_FAULTS = 1_000
@@ -108,34 +105,3 @@ def explain_damage(store: Store) -> Iterator[None]:
     else:
         return
     raise CorruptError(f"{printable(fault)}; `{command_line('verify', store.name)}` lists every damaged file")
-
-
-_TABLE = "CREATE TABLE paths (path BLOB PRIMARY KEY, sha256 TEXT) WITHOUT ROWID"
-
-
-class PathIndex:
-    """Takes paths with their SHA-256 in any order, and answers whether a path is among them. Raises sqlite3's errors."""
-
-    def __init__(self, folder: Path) -> None:
-        self._db = open_scratch(folder / "paths.sqlite", _TABLE)
-
-    def add(self, path: str, sha256: str = "") -> str | None:
-        """Takes a path; the SHA-256 that it was given before, None where it is new."""
-        key = os.fsencode(path)
-        known = self._db.execute("SELECT sha256 FROM paths WHERE path = ?", (key,)).fetchone()
-        if known is None:
-            self._db.execute("INSERT INTO paths VALUES (?, ?)", (key, sha256))
-        return known[0] if known else None
-
-    def add_all(self, paths: Iterable[str]) -> None:
-        """Takes paths without digests."""
-        rows = ((os.fsencode(path),) for path in paths)
-        self._db.executemany("INSERT INTO paths VALUES (?, '') ON CONFLICT DO NOTHING", rows)
-
-    def __contains__(self, path: str) -> bool:
-        row = self._db.execute("SELECT 1 FROM paths WHERE path = ?", (os.fsencode(path),))
-        return row.fetchone() is not None
-
-    def close(self) -> None:
-        """Closes the file."""
-        self._db.close()

@@ -30,8 +30,8 @@ from schemas.errors import CommitConflict, CorruptError, MachineError
 from schemas.job.job import job_digest
 from services.job.record import JobRecord, decode_job, is_job_sealed
 from services.merge.merge import Merging
-from services.merge.reading import RangeRows
-from services.read.verdict import COPY, PathIndex, Verdict, describe_os_error, read_or_tell
+from services.merge.reading import PathTable, RangeRows
+from services.read.verdict import COPY, Verdict, describe_os_error, read_or_tell
 from services.read.verify_files import (
     Known,
     Success,
@@ -161,7 +161,7 @@ TOP_FILES = (JOB_FILE, README_FILE, SUCCESS_FILE, FINGERPRINT_FILE, LEDGER_FILE,
 def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
     """Reads everything back. Raises OutputError where a newer version wrote it, MachineError where TMPDIR is full."""
     verdict = Verdict(store.name)
-    with _temporary_folder() as folder, contextlib.closing(PathIndex(folder)) as index:
+    with _temporary_folder() as folder, contextlib.closing(PathTable(folder / "paths.sqlite")) as index:
         job, success = read_stored_job(store, verdict), read_stored_success(store, verdict)
         reading = Reading(store, job.record.job if job.record else None, job.digest, index, verdict)
         # The scenes that must be there: by job.yaml, or by `_SUCCESS` where job.yaml is damaged.
@@ -177,7 +177,7 @@ def verify(store: Store, progress: Callable[[Verdict], None]) -> Verdict:
         check_fingerprint(store, terms, verdict)
         _check_finished(store, success, spans, remade, index, verdict)
         _check_ledger(store, verdict)
-        index.add_all(TOP_FILES)
+        index.add_paths(TOP_FILES)
         lost = sorted([*spans.gaps, *spans.unreadable])
         pairs = job.record.job.pairs_per_scene if job.record else 1
         tell_strays(store, Known(index, success.data is None, tuple(lost), 2 * pairs), verdict)
@@ -196,7 +196,7 @@ def _read_ranges(
     groups = commit_groups(reading.store)
     following = [*(start for start, _ in groups[1:]), sys.maxsize]
     for (start, retries), next_start in zip(groups, following, strict=True):
-        reading.index.add_all(commit_path(start, retry) for retry in retries)
+        reading.index.add_paths(commit_path(start, retry) for retry in retries)
         records = read_records(reading.store, start, retries, reading.verdict)
         if not records:  # nothing says where it ends
             spans.take(start, min(start + spans.range_size, next_start), False)
@@ -235,13 +235,13 @@ def _check_finished(
     success: Success,
     spans: Spans,
     remade: tuple[dict[str, Any], dict[str, Path]] | None,
-    index: PathIndex,
+    index: PathTable,
     verdict: Verdict,
 ) -> None:
     """Compares what the merge wrote with what the commits give, or says that the dataset is not finished."""
     if remade is not None:
-        index.add_all(remade[1])
-    index.add_all(success.files)
+        index.add_paths(remade[1])
+    index.add_paths(success.files)
     if success.data is None:
         _tell_unfinished(spans, remade and remade[0], verdict)
         return

@@ -30,8 +30,9 @@ from schemas.dataset.layout import (
     pose_of_image,
 )
 from services.merge.merge import encode_success, file_entry
+from services.merge.reading import PathTable
 from services.merge.tables import is_card_sealed
-from services.read.verdict import MOVE, PathIndex, Verdict, describe_os_error, printable, read_or_tell
+from services.read.verdict import MOVE, Verdict, describe_os_error, printable, read_or_tell
 from workers.store.file_system import sha256_of
 from workers.store.store import Store
 
@@ -51,7 +52,7 @@ Kind = Literal["file", "empty folder", "link", "special", "unreadable"]
 class Known:
     """What belongs to the dataset, beside its commit records."""
 
-    index: PathIndex
+    index: PathTable
     merging: bool
     """Whether merged files of an earlier merge may stand: there is no `_SUCCESS`."""
     lost: tuple[tuple[int, int], ...]
@@ -60,7 +61,11 @@ class Known:
 
     def has(self, key: str) -> bool:
         """Whether a file is the dataset's, or may be, because it may belong to a commit that cannot be read."""
-        if key in self.index or (self.merging and is_merged_path(key)) or key.startswith(f"{COMMITS}/{PROBE_PREFIX}"):
+        if (
+            self.index.get(key) is not None
+            or (self.merging and is_merged_path(key))
+            or key.startswith(f"{COMMITS}/{PROBE_PREFIX}")
+        ):
             return True
         if not self.lost:
             return False
@@ -95,7 +100,7 @@ def tell_strays(store: Store, known: Known, verdict: Verdict) -> None:
             if range_of and store.size(commit := commit_path(int(range_of[1]), int(range_of[2] or 0))) is None:
                 what += f", and {commit} is missing"
                 remedy = f"restore that from a copy, or {verdict.run_again} --retry-failed"
-        elif kind == "empty folder" and (known.merging or key in FRAME or key in known.index):
+        elif kind == "empty folder" and (known.merging or key in FRAME or known.index.get(key) is not None):
             continue
         verdict.tell(f"{key}: {what}", remedy, "stray")
 

@@ -13,8 +13,9 @@ from schemas.dataset.layout import COMMITS, RANGES, commit_path, is_shape, parse
 from schemas.dataset.tables import DETERMINISTIC_TABLES, TABLES
 from schemas.errors import CorruptError, command_line, needs_making
 from schemas.job.job import Job
+from services.merge.reading import PathTable
 from services.read.dataset_reader import Members, ReadFile, StoredRange, committed_reader, file_reader
-from services.read.verdict import COPY, MOST_FAULTS, PathIndex, Verdict, describe_os_error
+from services.read.verdict import COPY, MOST_FAULTS, Verdict, describe_os_error
 from workers.store.commit import committed_files, read_record
 from workers.store.images import decode_png
 from workers.store.ledger import range_rows
@@ -115,7 +116,7 @@ class Reading:
     job: Job | None
     job_digest: str | None
     """Of the keys of job.yaml as they are: labels of commits of another job cannot be derived."""
-    index: PathIndex
+    index: PathTable
     """Gets the path of every file that the ranges name."""
     verdict: Verdict
 
@@ -159,7 +160,8 @@ class ReadRange:
     def _check_files(self, entries: Sequence[FileEntry]) -> None:
         """Tells of files that are missing or differ from their SHA-256. Reads those that were not read yet."""
         for entry in entries:
-            known = self._reading.index.add(entry.path, entry.sha256)
+            known = self._reading.index.get(entry.path)
+            self._reading.index.add_all([(entry.path, entry.sha256)])
             if known is not None and not is_shape(entry.path):
                 self.verdict.tell(f"{entry.path}: is named by two commits", COPY)
             if known != entry.sha256 and (fault := self._check_file(entry)):

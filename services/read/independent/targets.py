@@ -59,17 +59,13 @@ ENOUGH_WRONG = 40
 class Finding:
     """One target of one view.
 
-    pixels: judged ones whose rays meet something, beside all others, which must be 0; edges: of these, where the centre is near
-    an edge; other: of these, where another choice of faces than the exact one is stored; unjudged: where there are too many
-    choices; wrong, and the first (column, row) of them; worst: the largest error in `unit` away from edges.
+    pixels: judged ones whose rays meet something, beside all others, which must be 0; wrong, and the first (column, row) of
+    them; worst: the largest error in `unit` away from edges.
     """
 
     target: str
     unit: str
     pixels: int
-    edges: int
-    other: int
-    unjudged: int
     wrong: int
     first: tuple[int, int]
     worst: float
@@ -85,15 +81,15 @@ def check_targets(pair: StoredPair, view: Row) -> Iterator[str]:
         pair.absent.append(str(error))
         return
     if pair.targets["views"]:
-        yield from _check_columns(pair, view, faces)
-    for one in judge_images(pair, view, faces):
-        pair.findings.append(one)
-        if one.wrong:
-            at = f"pixel {one.first} is the first, the worst away from edges is {one.worst:.3g} {one.unit}"
-            yield f"{one.target}: {one.wrong} of {one.pixels} pixels are not what the shapes show: {at}"
+        yield from _check_columns(pair, view)
+    for finding in judge_images(pair, view, faces):
+        pair.findings.append(finding)
+        if finding.wrong:
+            at = f"pixel {finding.first} is the first, the worst away from edges is {finding.worst:.3g} {finding.unit}"
+            yield f"{finding.target}: {finding.wrong} of {finding.pixels} pixels are not what the shapes show: {at}"
 
 
-def _check_columns(pair: StoredPair, view: Row, faces: Faces) -> Iterator[str]:
+def _check_columns(pair: StoredPair, view: Row) -> Iterator[str]:
     """Extents and shares against their images, scale and offset of coordinates against the boxes of the shapes."""
     rows = pair.labels(view)
     asked, shapes = pair.targets["views"], {body["region_id"]: body for body in pair.bodies}
@@ -133,7 +129,7 @@ def judge_images(pair: StoredPair, view: Row, faces: Faces) -> list[Finding]:
     findings = [_judge_seen(kind, pair, view, faces, own) for kind in seen]
     objects = hits.where(of_objects(faces.region[hits.face]))
     if "covisible" in pair.kinds(view["role"]):
-        findings.append(_judge_covisible(pair, view, faces, own))
+        findings.append(_judge_covisible(pair, view, own))
     if "amodal" in asked:
         findings += [_judge_amodal(pair, view, faces, objects, number) for number in pair.regions]
     if "layers" in asked:
@@ -159,21 +155,18 @@ def _settle(exact: _Exact, view: Row, faces: Faces, hits: Hits, fits: Callable[[
     met, edge = np.zeros((2, len(exact.judged)), bool)
     met[hits.pixel] = True
     edge[hits.pixel[~hits.sure]] = True
-    unjudged, wrong = 0, list[int]()
+    wrong = list[int]()
     for pixel in np.flatnonzero(exact.bad).tolist():
         start, stop = np.searchsorted(hits.pixel, [pixel, pixel + 1])
         there = hits.where(slice(start, stop))
-        if len(wrong) >= ENOUGH_WRONG:
-            wrong.append(pixel)
-        elif np.count_nonzero(~there.sure) > MOST_UNSURE:
-            unjudged += 1
-        elif not any(fits(pixel, there.where(some)) for some in choices(faces, there)):
+        is_judged = np.count_nonzero(~there.sure) <= MOST_UNSURE
+        if len(wrong) >= ENOUGH_WRONG or (
+            is_judged and not any(fits(pixel, there.where(some)) for some in choices(faces, there))
+        ):
             wrong.append(pixel)
     row, column = divmod(wrong[0], view["width"]) if wrong else (-1, -1)
-    pixels, edges, bad = (int(np.count_nonzero(some)) for some in (exact.judged & met, exact.judged & edge, exact.bad))
-    worst = float(exact.off[exact.judged & ~edge].max(initial=0.0))
-    other = bad - unjudged - len(wrong)
-    return Finding(exact.target, exact.unit, pixels, edges, other, unjudged, len(wrong), (column, row), worst)
+    pixels, worst = int(np.count_nonzero(exact.judged & met)), exact.off[exact.judged & ~edge].max(initial=0.0)
+    return Finding(exact.target, exact.unit, pixels, len(wrong), (column, row), float(worst))
 
 
 def _judge_seen(kind: Kind, pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Finding:
@@ -303,7 +296,7 @@ _ANSWERS: dict[str, tuple[int, str, Callable[[StoredPair, Row, Faces, Hits, NDAr
 """Formulas that rows of modalities name: least region that has it, the unit of its errors, and what they are."""
 
 
-def _judge_covisible(pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Finding:
+def _judge_covisible(pair: StoredPair, view: Row, own: Hits) -> Finding:
     """255 where the input camera sees the point of an object, 0 elsewhere: judged at some pixels, against every face there is.
 
     As many at edges of the mask as of objects elsewhere, evenly by number; not those near an edge in this view, see `seen_by`.
@@ -321,8 +314,7 @@ def _judge_covisible(pair: StoredPair, view: Row, faces: Faces, own: Hits) -> Fi
     differ = (answers >= 0) & (answers * 255 != mask.reshape(-1)[nearest.pixel])
     wrong = np.union1d(nearest.pixel[differ], np.flatnonzero((mask != 0) & ~(shown & (mask == 255))))
     row, column = divmod(int(wrong[0]), view["width"]) if len(wrong) else (-1, -1)
-    unjudged = len(pixels) - int(np.count_nonzero(answers >= 0))
-    return Finding("covisible", "of 255", len(pixels), 0, 0, unjudged, len(wrong), (column, row), float(len(wrong) > 0))
+    return Finding("covisible", "of 255", len(pixels), len(wrong), (column, row), float(len(wrong) > 0))
 
 
 def _judge_amodal(pair: StoredPair, view: Row, faces: Faces, objects: Hits, number: int) -> Finding:

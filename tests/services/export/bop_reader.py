@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from tests.services.export.image_loaders import read_picture
 
 
 @dataclass
@@ -50,12 +51,6 @@ def transform_of(entry: dict[str, Any], name: str) -> NDArray:
     T[:3, :3] = np.reshape(entry[f"cam_R_{name}"], (3, 3))
     T[:3, 3] = entry[f"cam_t_{name}"]
     return T
-
-
-def read_picture(path: Path) -> NDArray:
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert pixels is not None, f"{path} is missing"
-    return pixels
 
 
 def load_shots(split: Path) -> Iterator[Shot]:

@@ -14,8 +14,9 @@ from services.export.bop import NO_SHAPE, model_info, ply_lines
 from services.export.shapes import box_of, reaches_edge, whole_silhouette
 from tests.datasets import make_dataset
 from tests.kit.shapes import shape_of
-from tests.services.export.bop_reader import load_model, load_shots, points_in_model, read_picture
+from tests.services.export.bop_reader import load_model, load_shots, points_in_model
 from tests.services.export.exported import export_to, source_image, source_rows, without_sources
+from tests.services.export.image_loaders import read_picture
 
 PLACES = {"input": 0, "aligned": 1, "mirror": 2}
 WORDS = {"input": ("RGB", "depth", "segment"), "aligned": ("RGBaligned", "depthAligned", "segmentAligned")}

@@ -7,10 +7,13 @@ import struct
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from services.export.graphics import NO_SOURCES
+from tests.datasets import make_dataset
 from tests.services.export.exported import export_to, source_poses, source_rows, without_sources
+from workers.assets.look.surroundings import THICK_M
 
 
 def read_glb(path):
@@ -96,6 +99,26 @@ def test_cameras_stand_where_the_views_were_taken_from(pile, exported):
     perspective = tree["cameras"][0]["perspective"]
     assert perspective["yfov"] == pytest.approx(2 * math.atan(60 / 131.25))
     assert perspective["aspectRatio"] == pytest.approx(160 / 120)
+
+
+def test_walls_and_clutter_stand_where_the_scene_has_them(tmp_path):
+    look = {"room": True, "clutter": {"count": 2}, "environment": {"built_in": ["window_room"]}}
+    store, _ = make_dataset(tmp_path / "out", scenes=1, categories=["can"], look=look)
+    (around,) = (row["surroundings"] for row in source_rows(store.root, "scenes"))
+    assert around["clutter"]
+    export_to(store, tmp_path / "new", "gltf")
+    (path,) = (tmp_path / "new").glob("*/*.glb")
+    nodes, posed = placed(read_glb(path)[0]), trimesh.load_scene(path)
+    for piece in around["clutter"]:
+        name = f"clutter {piece['category']} {piece['instance_id']} {piece['region_id']}/"
+        own = [T for node, T in nodes.items() if node.startswith(name)]
+        assert own
+        for T in own:
+            np.testing.assert_allclose(T, Y_UP_FROM_Z_UP @ np.reshape(piece["T_world_obj"], (4, 4)), atol=1e-6)
+    corners = np.concatenate([mesh.vertices for name, mesh in posed.geometry.items() if name.startswith("walls/")])
+    length, width, height = around["room_m"]
+    np.testing.assert_allclose(np.abs(corners).max(axis=0)[:2], [length / 2 + THICK_M, width / 2 + THICK_M], atol=1e-6)
+    assert corners[:, 2].max() == pytest.approx(height) and corners[:, 2].min() == pytest.approx(0.0)
 
 
 def test_captures_have_their_board_and_scenes_with_neither_shapes_nor_sources_are_left_out(captures, pile, tmp_path):

@@ -12,6 +12,7 @@ from services.export.objects import NO_POINTS, NO_SAMPLES
 from services.export.source import ExportScene
 from tests.datasets import make_dataset
 from tests.judge.nearest import distances_to_faces, winding_numbers
+from tests.services.export.conftest import STUDIO
 from tests.services.export.exported import export_to, source_image, source_rows
 from tests.services.export.shape_loaders import load_completions, load_models
 
@@ -102,6 +103,15 @@ def test_cameras_project_the_cloud_onto_the_object_and_its_colours(shaped, expor
             assert np.median(gap) < 6.0 and gap.mean() < shifted.mean()
             seen += 1
     assert seen == sum(manifest["images"].values()) == 6
+
+
+def test_an_object_that_is_stored_with_alpha_has_images_without(tmp_path):
+    far = {"sensor": STUDIO["cameras"]["sensor"], "more": [{"name": "far", "ring": {"count": 2, "radius_m": 8.0}}]}
+    asked = {"shape": ["surface", "volume"], "points": 300}
+    store, _ = make_dataset(tmp_path / "out", **{**STUDIO, "scenes": 1, "cameras": far, "targets": asked})
+    assert sum(export_to(store, tmp_path / "new", "occnet").manifest["images"].values()) >= 2
+    (model,) = (model for split in SPLITS for model in load_models(tmp_path / "new", split))
+    assert len(model.shots) >= 2
 
 
 def test_an_object_whose_shape_has_no_samples_is_left_out(shaped, tmp_path, monkeypatch):

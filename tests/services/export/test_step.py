@@ -19,13 +19,12 @@ from schemas.job.assets import SplitShares
 from schemas.scene.shape import Material, Part
 from services.cli.main import main
 from services.dataset import dataset as splits
-from services.dataset.dataset import Splits, collect_ids, split_by_category
+from services.dataset.dataset import Dataset, Splits, collect_ids, split_by_category
 from services.export.folder import ExportFolder
 from services.export.shapes import Shapes, vertex_colors
 from services.export.source import iter_records, scenes_of
 from services.export.table import FORMATS
 from services.job.record import require_job
-from services.read.dataset_reader import read_stored
 from services.read.scene_geometry import Sources
 from tests.datasets import in_a_bucket, make_dataset
 from tests.services.export.exported import contents, export_to, source_rows
@@ -237,7 +236,7 @@ def test_an_image_that_is_lost_is_an_error_and_never_left_out(copy, tmp_path):
 
 
 def first_scene(store):
-    (scene,) = scenes_of(store, read_stored(store, next(iter_records(store, list_codes(store)))), [0], Splits({}))
+    (scene,) = scenes_of(Dataset(store), next(iter_records(store, list_codes(store))), {0}, Splits({}))
     return scene
 
 

@@ -7,8 +7,6 @@ Where a default has become another one, or a stored table another form, this is 
 import shutil
 from pathlib import Path
 
-import pytest
-
 from schemas.job.job import job_digest
 from services.job.job_file import validate_job
 from services.job.record import require_job
@@ -33,13 +31,8 @@ KEYS = {
 }
 
 
-@pytest.fixture
-def store(tmp_path) -> LocalStore:
-    shutil.copytree(KEPT, tmp_path / "kept")
-    return LocalStore(tmp_path / "kept")
-
-
-def test_a_dataset_that_an_earlier_version_made_is_verified_and_its_job_has_the_digest_that_was_written(store):
+def test_a_dataset_that_an_earlier_version_made_is_verified_and_its_job_has_the_digest_that_was_written(tmp_path):
+    store = LocalStore(shutil.copytree(KEPT, tmp_path / "kept"))
     record = require_job(store)
     assert faults_of(store) == [] and job_digest(record.job, record.catalogue) == record.digest
 
