@@ -209,12 +209,7 @@ def import_recording(options: argparse.Namespace) -> int:
     if not options.board:
         print(f"  no --board: board.json is the default board ({board.words}, {board.dictionary})")
     if options.json:
-        answer = {
-            "ok": True,
-            "out": str(out),
-            "frames": made.frames,
-            "default_board": not options.board,
-        }
+        answer = {"ok": True, "out": str(out), "frames": made.frames, "default_board": not options.board}
         print(json.dumps({**answer, **asdict(made)}))
     return 0
 
@@ -342,7 +337,8 @@ def _against_truth(result: "CaptureViews") -> tuple["SurfaceErrors", dict[str, A
         )
     score = score_capture(result, truth)
     poses = {"pose_mm": score.summary.pose_mm, "pose_deg": score.summary.pose_deg}
-    poses |= {"pose_worst_mm": max(score.poses.mm), "pose_worst_deg": max(score.poses.deg)}
+    for unit in ("mm", "deg"):
+        poses[f"pose_worst_{unit}"] = max(getattr(view, f"pose_{unit}") for view in score.summary.views.values())
     print(f"poses    median {poses['pose_mm']:.3f} mm, {poses['pose_deg']:.4f} degrees")
     print(f"         worst {poses['pose_worst_mm']:.3f} mm, {poses['pose_worst_deg']:.4f} degrees")
     for number, errors in score.held_out.items():

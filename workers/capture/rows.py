@@ -19,6 +19,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_NOTHING, REGION_TABL
 from schemas.scene.view import Camera, Pair, Role, View
 from workers.assets.glb import asset_glb
 from workers.capture.process import residual_columns
+from workers.capture.surface.posed_view import pinhole_rays
 from workers.geometry.pixels import quantise_depth
 from workers.scene.cameras import place_mirror_camera
 from workers.scene.context import WorkerContext
@@ -38,8 +39,7 @@ def capture_regions(camera: Camera, board: Board, mask: NDArray[np.bool_]) -> ND
     """
     k, T = camera.intrinsics, camera.T_world_cam
     half = 0.5 * board.scale * np.array([board.width_m, board.height_m])
-    x = (np.arange(k.width) + 0.5 - k.cx) / k.fx
-    y = ((np.arange(k.height) + 0.5 - k.cy) / k.fy)[:, None]
+    x, y = pinhole_rays(k, (k.height, k.width))
     rays = [T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] for axis in range(3)]
     with np.errstate(divide="ignore", invalid="ignore"):
         z = -T[2, 3] / rays[2]
