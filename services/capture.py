@@ -167,7 +167,8 @@ def simulate(options: argparse.Namespace) -> int:
     catalogue = open_sources(job, Path.cwd())
     asset = load_object(job, catalogue, chance)
     plan = plan_capture(settings)
-    truth = simulate_capture(settings, job.captures.printed_board, asset, chance, _make_empty(path))
+    around = job.look, catalogue
+    truth = simulate_capture(settings, job.captures.printed_board, asset, chance, _make_empty(path), around=around)
     seconds, ran = time.perf_counter() - begun, [name for name in CAPTURE_EFFECTS if plan.runs(name)]
     views = len(truth.T_board_cam)
     print(

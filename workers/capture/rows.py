@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,14 +150,16 @@ SCORES = ("pose_mm", "pose_deg", "cloud_median_mm", "cloud_p95_mm", "completenes
 class Origin:
     """A folder to process, the name of its object where the job knows it, and where it came from.
 
-    `input_sha256` of the folder, None where it was simulated; `effects` that were simulated; `skipped`: [{effect, why}].
+    `input_sha256` of the folder, None where it was simulated; `effects` that were simulated; `skipped`: [{effect, why}];
+    `surroundings`: what was drawn of `look`.
     """
 
     path: Path
     name: str | None
     input_sha256: str | None
-    effects: tuple[str, ...] = ()
-    skipped: tuple[Mapping[str, str], ...] = ()
+    effects: Sequence[str] = ()
+    skipped: Sequence[Mapping[str, str]] = ()
+    surroundings: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -234,7 +237,7 @@ def scene_row(
         "skipped": [dict(effect) for effect in origin.skipped],
         "raycast_checked": False,
         "settings_digest": context.settings_digest,
-        "surroundings": None,
+        "surroundings": origin.surroundings,
         "capture": quality_columns(done, origin, shares, left_out),
     }
 

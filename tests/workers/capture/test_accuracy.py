@@ -27,7 +27,6 @@ from workers.capture.simulate.simulate import DEPTH_UNITS_PER_M, measure_depth, 
 from workers.capture.simulate.studio import build_studio, place_object
 from workers.capture.truth import read_truth
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.effects import plan_capture
 from workers.store.images import encode_png
 
 NOISE = Simulate(views=40, depth_noise=KinectDepthNoise(), rgb_noise=RgbNoise())
@@ -53,7 +52,7 @@ def with_other_depth(path: Path, simulate: Simulate, asset: Asset, number: int) 
     shutil.copytree(path, other, copy_function=os.link)
     chance = chance_of(number)
     thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
-    studio = build_studio(simulate, Board(), thing, plan_capture(simulate), chance)
+    studio = build_studio(simulate, Board(), thing, chance)
     truth = read_truth(path)
     assert truth is not None
     for view, T_board_cam in enumerate(truth.T_board_cam):
