@@ -414,7 +414,8 @@ class _Child:
 def _start(process: Any, module: str) -> None:
     """Starts a child without this process's main module, which it does not need: a script without a guard would run again."""
     with _lock:
-        _processes.set_forkserver_preload([module])  # of the first work, which the server then imports once for all
+        # Of the first work: the server imports it once for all.
+        _processes.set_forkserver_preload([module, "workers.warm"])
         main = sys.modules["__main__"]
         sys.modules["__main__"] = ModuleType("__main__")
         try:
