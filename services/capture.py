@@ -167,7 +167,8 @@ def simulate(options: argparse.Namespace) -> int:
     catalogue = open_sources(job, Path.cwd())
     asset = load_object(job, catalogue, chance)
     plan = plan_capture(settings)
-    truth = simulate_capture(settings, job.captures.printed_board, asset, chance, _make_empty(path))
+    around = job.look, catalogue
+    truth = simulate_capture(settings, job.captures.printed_board, asset, chance, _make_empty(path), around=around)
     seconds, ran = time.perf_counter() - begun, [name for name in CAPTURE_EFFECTS if plan.runs(name)]
     views = len(truth.T_board_cam)
     print(
@@ -209,12 +210,7 @@ def import_recording(options: argparse.Namespace) -> int:
     if not options.board:
         print(f"  no --board: board.json is the default board ({board.words}, {board.dictionary})")
     if options.json:
-        answer = {
-            "ok": True,
-            "out": str(out),
-            "frames": made.frames,
-            "default_board": not options.board,
-        }
+        answer = {"ok": True, "out": str(out), "frames": made.frames, "default_board": not options.board}
         print(json.dumps({**answer, **asdict(made)}))
     return 0
 
@@ -342,7 +338,8 @@ def _against_truth(result: "CaptureViews") -> tuple["SurfaceErrors", dict[str, A
         )
     score = score_capture(result, truth)
     poses = {"pose_mm": score.summary.pose_mm, "pose_deg": score.summary.pose_deg}
-    poses |= {"pose_worst_mm": max(score.poses.mm), "pose_worst_deg": max(score.poses.deg)}
+    for unit in ("mm", "deg"):
+        poses[f"pose_worst_{unit}"] = max(getattr(view, f"pose_{unit}") for view in score.summary.views.values())
     print(f"poses    median {poses['pose_mm']:.3f} mm, {poses['pose_deg']:.4f} degrees")
     print(f"         worst {poses['pose_worst_mm']:.3f} mm, {poses['pose_worst_deg']:.4f} degrees")
     for number, errors in score.held_out.items():

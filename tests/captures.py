@@ -136,7 +136,9 @@ def estimates(views: int) -> Estimates:
 def use_exact_captures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replaces simulation and processing in this process: a capture named mug-n is `exact_capture(n)`."""
 
-    def simulate(simulate: Simulate, board: Board, asset: Asset, chance: SceneChance, path: Path) -> None:
+    def simulate(
+        simulate: Simulate, board: Board, asset: Asset, chance: SceneChance, path: Path, around: object
+    ) -> None:
         write_folder(path, f"mug-{chance.scene_id % 2}", board)
 
     def process(folder: CaptureFolder, captures: Captures, watch: Stopwatch) -> ProcessedCapture:
@@ -159,6 +161,5 @@ def write_folder(path: Path, name: str, board: Board | None = None, truth: bool 
             path,
             known,
             make_asset("mug", ProceduralSource(source="procedural"), 0, 1000.0),
-            ("depth_noise",),
-            {"motion_blur": "is not asked for"},
+            EffectPlan(("depth_noise",), {"motion_blur": "is not asked for"}),
         )

@@ -374,8 +374,12 @@ def _unfit_for_captures(job: Job, captures: Captures) -> str | None:
         return "cameras.depth.enabled is true: leave it out, depth of a capture is registered to its colour camera"
     if job.objects_per_scene != ONE_OBJECT:
         return "objects_per_scene must be 1: a capture is of one object"
-    if given := [name for name, value in job.look if name != "recolour" and value is not None]:
-        return f"look.{given[0]} is given: leave it out, a capture shows its board on a built-in floor"
+    shown = {"recolour"} if folders else {"recolour", "floor", "room"}
+    if given := [name for name, value in job.look if name not in shown and value is not None]:
+        what = (
+            "photographs show what they show" if folders else "of look a virtual capture has recolour, floor and room"
+        )
+        return f"look.{given[0]} is given: leave it out, {what}"
     if job.sensor != SensorEffects():
         return "sensor has effects: leave them out, those of a virtual capture are keys of captures.simulate"
     if unfit := [name for name in job.targets.views if name in ("albedo", "covisible", "amodal")] + list(

@@ -17,7 +17,7 @@ from workers.assets.catalogue import open_catalogue
 from workers.capture.folder import CaptureFile, open_folder, write_description, write_view
 from workers.capture.make_capture import load_object
 from workers.capture.process import process_folder
-from workers.capture.score import compare_poses, read_whole_truth
+from workers.capture.score import read_whole_truth
 from workers.capture.simulate.simulate import simulate_capture
 from workers.scene.chance import SceneChance
 from workers.scene.effects import CAPTURE_EFFECTS
@@ -60,8 +60,7 @@ def test_the_script_finds_the_poses_of_drawn_photographs_in_the_frame_of_the_boa
 
 def medians(poses: Mapping[int, Pose], true: Mapping[int, Pose]) -> tuple[float, float]:
     """Median errors over all true views, mm and degrees."""
-    scores = [compare_poses([poses[n]], [true[n]]) for n in true if n in poses]
-    each = [(score.median_mm, score.median_deg) for score in scores] + [NO_POSE] * (len(true) - len(scores))
+    each = [errors(poses[n], T) if n in poses else NO_POSE for n, T in true.items()]
     return median(mm for mm, _ in each), median(deg for _, deg in each)
 
 

@@ -57,11 +57,7 @@ def board_geometry(board: Board) -> Geometry:
     sides = np.linalg.norm(squares[pairs[:, 0] // 4, 1] - squares[pairs[:, 0] // 4, 0], axis=1)
     nearest = cKDTree(corners.reshape(-1, 3)).query(chess)[0] if len(chess) else np.zeros(0)
     free_m = np.minimum(nearest / math.sqrt(2.0), 0.5 * sides)  # a marker's corner lies on the diagonal
-    ids = (
-        np.sort([m.id for m in board.markers])
-        if board.markers
-        else board.first_id + np.arange(board.columns * board.rows)
-    )
+    ids = np.sort([m.id for m in board.markers]) if board.markers else board.first_id + np.arange(len(corners))
     return Geometry(ids, corners, squares, chess, pairs // 4, pairs % 4, free_m, right, below)
 
 
@@ -113,6 +109,11 @@ LARGEST = 999
 """The last id of the families' largest dictionaries."""
 
 
+def predefined_dictionary(name: str) -> "cv2.aruco.Dictionary":
+    """OpenCV's dictionary of a name in `PREDEFINED`."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+
+
 def smallest_dictionary(name: str, last_id: int) -> str:
     """The smallest dictionary of a family that has the id; the first markers of all in a family are the same."""
     family, _, size = name.rpartition("_")
@@ -155,7 +156,7 @@ def open_dictionary(board: Board, folder: Path | None = None) -> "cv2.aruco.Dict
     or where the dictionary has fewer markers than the board.
     """
     if board.dictionary in PREDEFINED:
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+        dictionary = predefined_dictionary(board.dictionary)
     else:
         path = None if folder is None or "/" in board.dictionary else folder / board.dictionary
         if path is None or not path.is_file():
@@ -234,9 +235,9 @@ def lay_out_print(board: Board) -> PrintLayout:
     return PrintLayout(width, height, markers, seams, ruler, arrow, words)
 
 
-def marker_cells(board: Board, folder: Path | None = None) -> NDArray[np.bool_]:
+def marker_cells(board: Board) -> NDArray[np.bool_]:
     """[N, n, n] bool: the black cells of each marker with its border, top row of OpenCV's picture first, by ascending id."""
-    dictionary = open_dictionary(board, folder)
+    dictionary = open_dictionary(board)
     side, border = dictionary.markerSize + 2 * board.border_bits, board.border_bits
     ids = board_geometry(board).ids.tolist()
     return np.stack([cv2.aruco.generateImageMarker(dictionary, n, side, borderBits=border) == 0 for n in ids])

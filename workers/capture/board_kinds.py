@@ -23,7 +23,7 @@ from pydantic import ValidationError
 from schemas.base import Array, frozen_array
 from schemas.errors import InputError
 from schemas.job.captures import Board
-from workers.capture.board import LARGEST, board_geometry, smallest_dictionary
+from workers.capture.board import LARGEST, PREDEFINED, board_geometry, predefined_dictionary, smallest_dictionary
 from workers.geometry.frames import pose, rotation_from_quaternion, transform
 
 SHEET_M = 0.03
@@ -233,9 +233,9 @@ def _board(**keys: Any) -> Board:
 
 
 def _predefined(name: str) -> "cv2.aruco.Dictionary":
-    if not hasattr(cv2.aruco, name) or not name.startswith("DICT_"):
+    if name not in PREDEFINED:
         raise InputError(f"{name!r} is no dictionary of OpenCV's (DICT_4X4_50, DICT_APRILTAG_36h11, ...)")
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    return predefined_dictionary(name)
 
 
 # ---------------------------------------------------------------------------------------------- files of other programs

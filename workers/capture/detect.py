@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.base import Array
+from schemas.base import Array, frozen_array
 from schemas.capture import CaptureCamera, Detection
 from schemas.job.captures import Board
 from workers.capture.board import (
@@ -22,6 +22,7 @@ from workers.capture.board import (
     Geometry,
     board_geometry,
     id_words,
+    predefined_dictionary,
     smallest_dictionary,
 )
 from workers.geometry.colour import SRGB_STEPS
@@ -181,10 +182,8 @@ def detect_markers(
     made = []
     for chosen in prints:
         chess, chess_px = _find_chess(gray, geometry, ids[chosen], corners[chosen])
-        marks = [corners[chosen] + 0.5, chess_px + 0.5]
-        for pixels in marks:
-            pixels.setflags(write=False)
-        made.append(Detection(number, ids[chosen], marks[0], tuple(dropped), chess, marks[1]))
+        marks, chess_px = frozen_array(corners[chosen] + 0.5), frozen_array(chess_px + 0.5)
+        made.append(Detection(number, ids[chosen], marks, tuple(dropped), chess, chess_px))
     return replace(made[0], others=tuple(made[1:]))
 
 
@@ -318,9 +317,8 @@ def _beside(number: int, geometry: Geometry, markers: Array, corners_px: Array) 
 def _is_corner(light: NDArray[np.float32], pair: Array, points: Array) -> bool:
     """Whether the light about the middle of a pair [2, 2] is a chessboard's; points [5, 2] as in `_beside`."""
     height, width = light.shape
-    if not (
-        (points >= 0).all() and (points < [width - 1, height - 1]).all() and np.isfinite(pair).all()
-    ):  # false of nan
+    inside = (points >= 0).all() and (points < [width - 1, height - 1]).all()  # false of nan
+    if not (inside and np.isfinite(pair).all()):
         return False
     free_px = float(np.linalg.norm(points[1:] - points[0], axis=1).min()) / (BESIDE * 2.0**0.5)
     off_px = max(np.linalg.norm(pair.mean(axis=0) - points[0]), np.linalg.norm(pair[1] - pair[0]))
@@ -342,8 +340,7 @@ def other_dictionary(rgb: NDArray[np.uint8]) -> tuple[str, str, int]:
     for name, (picture, how), border_bits in itertools.product(names, pictures, (1, 2)):
         if name != smallest_dictionary(name, LARGEST) or (border_bits > 1 and "APRILTAG" not in name):
             continue  # the first markers of the dictionary of 1000; two bits are Kalibr's
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
-        _, ids, _ = _detector(dictionary, border_bits).detectMarkers(picture)
+        _, ids, _ = _detector(predefined_dictionary(name), border_bits).detectMarkers(picture)
         if ids is not None and len(ids) > most:
             smallest, most = smallest_dictionary(name, int(np.median(ids))), len(ids)  # a few ids may be misread
             best = f"the image holds {most} markers of {smallest}{how}", "" if how else name, border_bits

@@ -263,11 +263,8 @@ def import_recording(
         ImportedView(n, int(color_us[i]), int(depth_us[pairs[i]]), measures[i].sharpness) for n, i in enumerate(chosen)
     )
     _write_views(recording, made, out)
-    origin: dict[str, Any] = {
-        "recording": path.name,
-        "calibration": "the recording's own calibration",
-        **recording.told,
-    }
+    origin: dict[str, Any] = {"recording": path.name, "calibration": "the recording's own calibration"}
+    origin |= recording.told
     origin |= {"losses": asdict(losses), "views": [asdict(view) for view in made]}
     (out / RECORDING_FILE).write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")
     write_description(out, about, stored, board)

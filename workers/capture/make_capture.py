@@ -180,8 +180,8 @@ def open_capture(context: WorkerContext, scene_id: int, watch: Stopwatch) -> Ite
         path = scratch / "capture"
         with watch.stage("simulate"):
             instance_id = simulate_one(context, scene_id, path)
-            effects, skipped = read_receipt(path)
-        yield Origin(path, instance_id, None, effects, skipped)
+            receipt = read_receipt(path)
+        yield Origin(path, instance_id, None, *receipt)
 
 
 def load_object(job: Job, catalogue: Catalogue, chance: SceneChance) -> Asset:
@@ -193,8 +193,8 @@ def load_object(job: Job, catalogue: Catalogue, chance: SceneChance) -> Asset:
 def simulate_one(context: WorkerContext, scene_id: int, path: Path) -> str:
     """Simulates a capture of the job into an empty folder; the instance id of its object."""
     captures, chance = require_captures(context.job), SceneChance(context.job.seed, scene_id)
-    asset = load_object(context.job, context.catalogue, chance)
-    simulate_capture(captures.simulate, captures.printed_board, asset, chance, path)
+    asset, around = load_object(context.job, context.catalogue, chance), (context.job.look, context.catalogue)
+    simulate_capture(captures.simulate, captures.printed_board, asset, chance, path, around=around)
     return asset.instance_id
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_NOTHING, REGION_TABL
 from schemas.scene.view import Camera, Pair, Role, View
 from workers.assets.glb import asset_glb
 from workers.capture.process import residual_columns
+from workers.capture.surface.posed_view import pinhole_rays
 from workers.geometry.pixels import quantise_depth
 from workers.scene.cameras import place_mirror_camera
 from workers.scene.context import WorkerContext
@@ -38,8 +40,7 @@ def capture_regions(camera: Camera, board: Board, mask: NDArray[np.bool_]) -> ND
     """
     k, T = camera.intrinsics, camera.T_world_cam
     half = 0.5 * board.scale * np.array([board.width_m, board.height_m])
-    x = (np.arange(k.width) + 0.5 - k.cx) / k.fx
-    y = ((np.arange(k.height) + 0.5 - k.cy) / k.fy)[:, None]
+    x, y = pinhole_rays(k, (k.height, k.width))
     rays = [T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] for axis in range(3)]
     with np.errstate(divide="ignore", invalid="ignore"):
         z = -T[2, 3] / rays[2]
@@ -149,14 +150,16 @@ SCORES = ("pose_mm", "pose_deg", "cloud_median_mm", "cloud_p95_mm", "completenes
 class Origin:
     """A folder to process, the name of its object where the job knows it, and where it came from.
 
-    `input_sha256` of the folder, None where it was simulated; `effects` that were simulated; `skipped`: [{effect, why}].
+    `input_sha256` of the folder, None where it was simulated; `effects` that were simulated; `skipped`: [{effect, why}];
+    `surroundings`: what was drawn of `look`.
     """
 
     path: Path
     name: str | None
     input_sha256: str | None
-    effects: tuple[str, ...] = ()
-    skipped: tuple[Mapping[str, str], ...] = ()
+    effects: Sequence[str] = ()
+    skipped: Sequence[Mapping[str, str]] = ()
+    surroundings: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -234,7 +237,7 @@ def scene_row(
         "skipped": [dict(effect) for effect in origin.skipped],
         "raycast_checked": False,
         "settings_digest": context.settings_digest,
-        "surroundings": None,
+        "surroundings": origin.surroundings,
         "capture": quality_columns(done, origin, shares, left_out),
     }
 

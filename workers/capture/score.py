@@ -37,24 +37,6 @@ MEASURED_M = 0.004
 
 
 @dataclass(frozen=True)
-class PoseErrors:
-    """Distance and angle between estimated and true camera poses, of each."""
-
-    mm: Sequence[float]
-    deg: Sequence[float]
-
-    @property
-    def median_mm(self) -> float:
-        """Median distance."""
-        return float(np.median(self.mm))
-
-    @property
-    def median_deg(self) -> float:
-        """Median angle."""
-        return float(np.median(self.deg))
-
-
-@dataclass(frozen=True)
 class SurfaceErrors:
     """Merged cloud against the true surface.
 
@@ -86,15 +68,6 @@ class ViewErrors:
     covered: float
     beyond: float
     measured_share: float
-
-
-def compare_poses(estimated: Sequence[Pose], true: Sequence[Pose]) -> PoseErrors:
-    """Errors of T_board_cam. Raises CaptureError for no poses."""
-    if not len(estimated):
-        raise CaptureError("no_pose", "no view has a pose that could be compared with the truth")
-    mm = [1e3 * float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a, b in zip(estimated, true, strict=True)]
-    deg = [float(np.degrees(angle_between(a[:3, :3], b[:3, :3]))) for a, b in zip(estimated, true, strict=True)]
-    return PoseErrors(mm, deg)
 
 
 def measured_points(points: Array, normals: Array, view: PosedView) -> NDArray[np.bool_]:
@@ -200,7 +173,6 @@ class Score:
     """All that was compared: the summary that a dataset stores, and by number the views that were left out in turn."""
 
     summary: CaptureScore
-    poses: PoseErrors
     surface: SurfaceErrors
     held_out: Mapping[int, ViewErrors]
 
@@ -240,16 +212,20 @@ def score_capture(views: CaptureViews, truth: Truth, held_out: int = HELD_OUT) -
     """The errors of poses, surface and synthesised views. Raises CaptureError where no used view has a true pose."""
     used = {view.number: view.T_board_cam for view in views.estimate.used if view.T_board_cam is not None}
     known = sorted(set(used) & set(truth.T_board_cam))
-    poses = compare_poses([used[n] for n in known], [truth.T_board_cam[n] for n in known])
+    if not known:
+        raise CaptureError("no_pose", "no view has a pose that could be compared with the truth")
+    pairs = [(used[n], truth.T_board_cam[n]) for n in known]
+    mm = [1e3 * float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a, b in pairs]
+    deg = [float(np.degrees(angle_between(a[:3, :3], b[:3, :3]))) for a, b in pairs]
     cameras = [Camera(views.folder.camera.intrinsics, truth.T_board_cam[n]) for n in known]
     surface = score_surface(views.surface, truth.surface, cameras)
     left_out = score_held_out(views, truth, known, held_out)
     depth_mm = {n: errors.depth_median_mm for n, errors in left_out.items()}
-    by_view = {n: ViewScore(mm, deg, depth_mm.get(n)) for n, mm, deg in zip(known, poses.mm, poses.deg, strict=True)}
+    by_view = {n: ViewScore(a, b, depth_mm.get(n)) for n, a, b in zip(known, mm, deg, strict=True)}
     depth = float(np.median(list(depth_mm.values()))) if depth_mm else None
     cloud = surface.cloud_median_mm, surface.cloud_p95_mm, surface.completeness
-    summary = CaptureScore(poses.median_mm, poses.median_deg, *cloud, depth, by_view)
-    return Score(summary, poses, surface, left_out)
+    summary = CaptureScore(float(np.median(mm)), float(np.median(deg)), *cloud, depth, by_view)
+    return Score(summary, surface, left_out)
 
 
 def score_surface(surface: Reconstruction, true: Mesh, cameras: Sequence[Camera]) -> SurfaceErrors:

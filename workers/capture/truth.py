@@ -8,6 +8,7 @@ held_out/        exact views from other poses, a folder like a capture's
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from schemas.base import Frozen, frozen_array
 from schemas.capture import CaptureTruth
 from schemas.job.views import Distortion
+from schemas.scene.scene import EffectPlan
 from schemas.scene.shape import Asset
 from workers.capture.folder import Matrix, read_json
 from workers.store.images import encode_mask
@@ -34,12 +36,13 @@ class TruthFile(Frozen):
     lens: Distortion | None
     effects: list[str]
     skipped: list[dict[str, str]]
+    surroundings: dict[str, Any] | None = None
 
 
 def write_truth(
-    path: Path, truth: CaptureTruth, asset: Asset, ran: tuple[str, ...], skipped: Mapping[str, str]
+    path: Path, truth: CaptureTruth, asset: Asset, plan: EffectPlan, surroundings: Mapping[str, object] | None = None
 ) -> None:
-    """Writes truth.json and mesh.glb below a capture's folder; `ran` and `skipped` are the receipt of effects."""
+    """Writes truth.json and mesh.glb below a capture's folder; `surroundings`: what was drawn of `look`."""
     from workers.assets.glb import asset_glb  # loads trimesh, which a run that lists captures has no use for
 
     arrays = {name: getattr(truth, name).tolist() for name in ("T_board_cam", "T_board_obj", "T_color_depth")}
@@ -48,14 +51,16 @@ def write_truth(
         print_scale=truth.print_scale,
         depth_bias_m=truth.depth_bias_m,
         lens=truth.lens,
-        effects=list(ran),
-        skipped=[{"effect": name, "why": why} for name, why in skipped.items()],
+        effects=list(plan.ran),
+        skipped=[{"effect": name, "why": why} for name, why in plan.skipped.items()],
+        surroundings=dict(surroundings) if surroundings else None,
         **arrays,
     )
     folder = path / TRUTH
     folder.mkdir(exist_ok=True)
     (folder / MESH_FILE).write_bytes(asset_glb(asset))
-    (folder / TRUTH_FILE).write_text(record.model_dump_json(indent=1) + "\n", encoding="utf-8")
+    without = None if surroundings else {"surroundings"}
+    (folder / TRUTH_FILE).write_text(record.model_dump_json(indent=1, exclude=without) + "\n", encoding="utf-8")
 
 
 def write_true_mask(path: Path, number: int, mask: NDArray[np.bool_]) -> None:
@@ -76,7 +81,7 @@ def read_truth(path: Path) -> CaptureTruth | None:
     return CaptureTruth(*poses, spec.depth_bias_m, spec.lens)
 
 
-def read_receipt(path: Path) -> tuple[tuple[str, ...], tuple[dict[str, str], ...]]:
-    """(names of the effects that ran, [{effect, why}] of those that did not) of a simulated capture's folder."""
+def read_receipt(path: Path) -> tuple[list[str], list[dict[str, str]], dict[str, Any] | None]:
+    """(effects that ran, [{effect, why}] of those that did not, what was drawn of `look`) of a simulated capture's folder."""
     spec = read_json(path / TRUTH / TRUTH_FILE, TruthFile)
-    return tuple(spec.effects), tuple(spec.skipped)
+    return spec.effects, spec.skipped, spec.surroundings

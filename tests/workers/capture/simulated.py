@@ -34,7 +34,6 @@ from workers.capture.simulate.studio import Studio, build_studio, place_object, 
 from workers.capture.truth import read_truth
 from workers.geometry.pixels import opencv_lens
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.effects import plan_capture
 
 KEPT = tempfile.TemporaryDirectory(prefix="verso-captures-")
 VIEWS = 10
@@ -53,17 +52,15 @@ def asset_of(category: str = "can", number: int = 3) -> Asset:
     return make_asset(category, ProceduralSource(source="procedural"), number, 600.0)
 
 
-def made(seed=11, without=(), **settings) -> Made:
-    """A capture of a can by its seed and settings; effects `without` are asked for and withdrawn from the plan."""
-    return _made(Simulate(**settings).model_dump_json(), seed, tuple(without))
+def made(seed=11, **settings) -> Made:
+    """A capture of a can by its seed and settings."""
+    return _made(Simulate(**settings).model_dump_json(), seed)
 
 
 @functools.cache
-def _made(settings: str, seed: int, without: tuple[str, ...]) -> Made:
-    simulate = Simulate.model_validate_json(settings)
+def _made(settings: str, seed: int) -> Made:
     path = Path(tempfile.mkdtemp(dir=KEPT.name))
-    plan = plan_capture(simulate).without(*without)
-    truth = simulate_capture(simulate, Board(), asset_of(), SceneChance(seed, 0), path, plan)
+    truth = simulate_capture(Simulate.model_validate_json(settings), Board(), asset_of(), SceneChance(seed, 0), path)
     return Made(open_folder(path), truth)
 
 
@@ -72,7 +69,7 @@ def studio_of(simulate: Simulate, board: Board | None = None, seed: int = 11) ->
     chance, asset = SceneChance(seed, 0), asset_of()
     thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
     poses = plan_path(simulate, thing.T_world_shape[:3, 3], chance.stream(Stream.CAMERA))
-    return build_studio(simulate, board or Board(), thing, plan_capture(simulate), chance), thing, poses
+    return build_studio(simulate, board or Board(), thing, chance), thing, poses
 
 
 def take_one(seed=11, **settings) -> tuple[CapturedView, CaptureCamera, Pose]:

@@ -10,24 +10,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from schemas.base import frozen_array
 from schemas.capture import Estimates
 from schemas.job.captures import Board, Captures, Estimation, KinectDepthNoise, RegistrationError, Simulate
 from schemas.job.views import RgbNoise
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset, Mesh
+from tests.workers.capture.drawn import errors
 from tests.workers.capture.simulated import asset_of, made
 from workers.capture.folder import open_folder
 from workers.capture.make_capture import process_capture
 from workers.capture.poses.terms import motion_between
 from workers.capture.process import CaptureViews
 from workers.capture.reconstruct import estimate_poses, given_files, processor_clock
-from workers.capture.score import compare_poses, read_whole_truth, score_measured
+from workers.capture.score import read_whole_truth, score_measured
 from workers.capture.simulate.simulate import DEPTH_UNITS_PER_M, measure_depth, simulate_capture
 from workers.capture.simulate.studio import build_studio, place_object
 from workers.capture.truth import read_truth
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.effects import plan_capture
 from workers.store.images import encode_png
 
 NOISE = Simulate(views=40, depth_noise=KinectDepthNoise(), rgb_noise=RgbNoise())
@@ -53,7 +52,7 @@ def with_other_depth(path: Path, simulate: Simulate, asset: Asset, number: int) 
     shutil.copytree(path, other, copy_function=os.link)
     chance = chance_of(number)
     thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
-    studio = build_studio(simulate, Board(), thing, plan_capture(simulate), chance)
+    studio = build_studio(simulate, Board(), thing, chance)
     truth = read_truth(path)
     assert truth is not None
     for view, T_board_cam in enumerate(truth.T_board_cam):
@@ -73,9 +72,8 @@ def pose_errors(path: Path, estimates: Estimates) -> dict:
         used = [(view.T_board_cam, truth.T_board_cam[view.number]) for view in one.used if view.T_board_cam is not None]
         if not used:  # all of its views are flagged, as the article's are where the print is of another size
             continue
-        errors = compare_poses([a for a, _ in used], [frozen_array(b) for _, b in used])
-        squares = [((a[:3, 3] - b[:3, 3]) ** 2).sum() for a, b in used]
-        found[name] = errors.median_mm, errors.median_deg, 1e3 * float(np.sqrt(np.mean(squares)))
+        off = np.array([errors(*pair) for pair in used])
+        found[name] = (*np.median(off, axis=0).tolist(), float(np.sqrt(np.mean(off[:, 0] ** 2))))
     return found
 
 

@@ -15,6 +15,7 @@ from schemas.capture import CaptureCamera, CapturedView, CaptureTruth, Reconstru
 from schemas.errors import CaptureError
 from schemas.job.captures import GRID_KEYS, Board
 from schemas.job.views import Distortion
+from schemas.scene.scene import EffectPlan
 from schemas.scene.view import Intrinsics
 from tests.workers.capture.simulated import asset_of
 from workers.capture.folder import (
@@ -192,7 +193,7 @@ def test_poses_and_truth_are_read_back_to_the_bit_and_what_is_none_is_refused(tm
             read_pose(path)
     for lens in (None, Distortion(k1=0.1, k3=-0.02)):
         truth = CaptureTruth(np.stack(poses[:3]), poses[3], 1.02, poses[4], 0.01, lens)
-        write_truth(tmp_path, truth, asset_of("mug"), ("rgb",), {"exposure": "is off"})
+        write_truth(tmp_path, truth, asset_of("mug"), EffectPlan(("rgb",), {"exposure": "is off"}))
         again = read_truth(tmp_path)
         for name in ("T_board_cam", "T_board_obj", "T_color_depth"):
             assert np.array_equal(getattr(again, name), getattr(truth, name))

@@ -1,7 +1,6 @@
 """Virtual captures: path, device and effects by themselves, and photographs against OpenCV's projection and a ray caster."""
 
 import hashlib
-import json
 import math
 
 import cv2
@@ -10,7 +9,7 @@ import pytest
 import trimesh
 
 from schemas.base import Range
-from schemas.errors import CaptureError
+from schemas.errors import CaptureError, StartError, ViewError
 from schemas.job.assets import CATEGORIES
 from schemas.job.captures import Board, Simulate
 from schemas.job.job import Job
@@ -35,16 +34,17 @@ from workers.capture.simulate.simulate import (
 )
 from workers.capture.simulate.studio import (
     COLOR,
+    THICKNESS_M,
     make_rig,
     pinhole_lookup,
     place_object,
     plan_path,
     true_board,
 )
-from workers.capture.truth import read_truth
+from workers.capture.truth import read_receipt, read_truth
 from workers.geometry.colour import encode_codes, encode_srgb
 from workers.geometry.frames import invert, transform
-from workers.geometry.pixels import opencv_lens, opencv_matrix
+from workers.geometry.pixels import opencv_lens, opencv_matrix, pixel_rays
 from workers.geometry.raycast import cast_view
 from workers.scene.chance import SceneChance
 from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
@@ -297,6 +297,42 @@ def test_the_folder_is_read_as_that_of_a_real_capture_and_its_truth_is_beside_it
         simulate_capture(Simulate(), Board(), asset_of(), SceneChance(11, 0), folder.path)
 
 
+def enclosed(k, T, size_m):
+    """(depth [H, W] of the floor below the board, that of the nearest wall, rays [H, W, 3]) of a camera in the board frame."""
+    rays = np.pad(pixel_rays(k, np.zeros(8)), ((0, 0), (0, 0), (0, 1)), constant_values=1.0) @ T[:3, :3].T
+    ends = np.dstack([np.copysign(0.5 * np.array(size_m[:2]), rays[..., :2]), np.full(rays.shape[:2], -THICKNESS_M)])
+    z = (ends - T[:3, 3]) / rays
+    return np.where(z[..., 2] > 0, z[..., 2], np.inf), z[..., :2].min(axis=2), rays
+
+
+def test_a_room_and_a_floor_stand_around_the_board_and_a_camera_outside_of_it_is_refused(tmp_path):
+    """Where a held-out view shows neither board nor object, depth is that of the level floor or of the nearest wall."""
+    job = Job(name="t", look={"room": {"size_m": [2.2, 2.4]}, "floor": {"colours": [[0.9, 0.1, 0.1]]}})
+    around, pixels = (job.look, open_catalogue(job.assets, tmp_path, job.categories)), 0
+    low = Simulate(views=1, image_scale=0.25, distance_m=[0.6, 0.8], inclination_rad=[0.5, 0.55])
+    simulate_capture(low, Board(), asset_of(), SceneChance(11, 0), tmp_path / "room", around=around)
+    size_m = read_receipt(tmp_path / "room")[2]["room_m"]
+    folder = open_folder(tmp_path / "room/truth/held_out")
+    for number in folder.numbers:
+        view, T = read_view(folder, number), read_pose(folder.path / f"board_{number:05d}.txt")
+        floor, wall, rays = enclosed(folder.camera.intrinsics, T, size_m)
+        depth_m = view.depth / folder.camera.depth_units_per_m
+        at = T[:3, 3] + depth_m[..., None] * rays
+        beside = (np.abs(at[..., :2]) > [0.31, 0.21]).any(axis=2) & ~view.mask
+        off = np.abs(depth_m - np.minimum(floor, wall))[beside]
+        assert np.quantile(off, 0.9) < 1e-4 and off.max() < 0.06  # a skirting and a window stand before the wall
+        red = view.rgb[beside & (floor < wall)].astype(int)
+        assert (red[:, 0] > 2 * red[:, 1]).mean() > 0.98
+        pixels += (beside & (wall < floor)).sum()
+    assert pixels > 2000
+    small = job.look.model_copy(update={"room": job.look.room.model_copy(update={"size_m": Range(1.0, 1.1)})})
+    with pytest.raises(ViewError, match=r"capture's camera stands .* raise look.room.size_m"):
+        simulate_capture(low, Board(), asset_of(), SceneChance(11, 0), tmp_path / "small", around=(small, around[1]))
+    wide = Board(width_m=1.2)
+    with pytest.raises(StartError, match="the board reaches"):
+        simulate_capture(low, wide, asset_of(), SceneChance(11, 0), tmp_path / "wide", around=(small, around[1]))
+
+
 def test_the_same_seed_writes_the_same_bytes_and_the_object_is_of_the_jobs_category(tmp_path):
     truth = simulate_capture(Simulate(**SMALL), Board(), asset_of(), SceneChance(11, 0), tmp_path)
     assert changed(Made(open_folder(tmp_path), truth), made(**SMALL)) == set()
@@ -314,14 +350,13 @@ def test_the_same_seed_writes_the_same_bytes_and_the_object_is_of_the_jobs_categ
         for name in CAPTURE_EFFECTS
     ],
 )
-def test_an_effect_changes_its_own_files_and_no_pose_and_nothing_where_it_is_withdrawn(name):
-    plain, value = made(**SMALL), {name: ON[name][0]}
-    asked, withdrawn = made(**SMALL, **value), made(without=(name,), **SMALL, **value)
-    assert changed(asked, plain) == ON[name][1] and changed(withdrawn, plain) == set()
+def test_an_effect_changes_its_own_files_and_no_pose(name):
+    plain, asked = made(**SMALL), made(**SMALL, **{name: ON[name][0]})
+    assert changed(asked, plain) == ON[name][1]
     assert np.array_equal(asked.truth.T_board_cam, plain.truth.T_board_cam)
-    ran, left = (json.loads((one.folder.path / "truth/truth.json").read_text()) for one in (asked, withdrawn))
-    assert name in ran["effects"] and name not in left["effects"]
-    assert {"effect": name, "why": "withdrawn"} in left["skipped"]
+    (ran, _, _), (others, skipped, _) = (read_receipt(one.folder.path) for one in (asked, plain))
+    assert name in ran and set(ran) - {name} == set(others)
+    assert {"effect": name, "why": f"captures.simulate.{name} is off"} in skipped
 
 
 def test_no_effect_changes_the_random_numbers_of_another():

@@ -1,5 +1,6 @@
 """Views as pinholes see them, from elsewhere too, against exact ones; and the measures of what is off."""
 
+import dataclasses
 import functools
 import re
 
@@ -33,8 +34,8 @@ from workers.capture.surface.posed_view import (
 )
 from workers.capture.surface.synthesize import (
     choose_sources,
+    color_depth,
     fill_holes,
-    move_depth,
     prepare_source,
     synthesize_view,
     warp,
@@ -178,12 +179,13 @@ def test_colours_and_depth_follow_a_depth_camera_that_stands_elsewhere():
     source = source_at(0.02)
     expected = cast(THING, source.camera)[2]
     assert np.median(np.abs(source.rgb.astype(int) - expected)[source.fitted.inverse > 0]) <= 2
-    measured, far = cast(THING, HOME)[0].astype(np.float32), source_at(0.01).camera
-    carried, truth = move_depth(measured, HOME, far), cast(THING, far)[0]
-    both = (carried > 0) & (truth > 0)
-    assert both.sum() > 0.9 * (truth > 0).sum() and np.quantile(np.abs(carried - truth)[both], 0.9) < 1e-4
-    same = move_depth(measured, HOME, HOME)
-    assert np.abs(same - measured)[same > 0].max() < 1e-5
+    aside = source_at(0.01).camera
+    depth, truth = (cast(THING, camera) for camera in (aside, HOME))
+    seen = PosedView(0, HOME, aside, truth[2], depth[0].astype(np.float32))
+    carried = color_depth(seen)
+    both = (carried > 0) & (truth[0] > 0)
+    assert both.sum() > 0.9 * (truth[0] > 0).sum() and np.quantile(np.abs(carried - truth[0])[both], 0.9) < 1e-4
+    assert color_depth(dataclasses.replace(seen, depth_camera=HOME)) is seen.depth_m
 
 
 # ---------------------------------------------------------------------------------------------- many views

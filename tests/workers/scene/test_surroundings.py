@@ -254,7 +254,8 @@ def test_pictures_are_turned_upright_reduced_and_part_of_what_decides_a_scene(tm
      ({"look": {"room": {"size_m": [0.5, 3]}}}, "must lie within 1 and 59"),
      ({"scene": "studio", "look": {"room": True}}, "scene is studio, and look.room is given"),
      ({"scene": "studio", "look": {"background": "x"}}, "studio.background is transparent, and look.background is given"),
-     ({"captures": {}, "look": {"room": True}}, "look.room is given: leave it out")],
+     ({"captures": {}, "look": {"clutter": {}}}, "look.clutter is given: leave it out, of look a virtual capture has"),
+     ({"captures": {"folders": ["x"]}, "look": {"room": True}}, "look.room is given: leave it out, photographs show")],
 )  # fmt: skip
 def test_surroundings_that_cannot_be_are_refused_by_their_key(keys, message):
     with pytest.raises(JobError, match=message):

@@ -207,13 +207,14 @@ _SEED = 60_733
 """Seed of the plaster, which is the same in every dataset."""
 
 
-def require_table_inside(walls: Walls, vertices: Array) -> None:
-    """Raises StartError where a table's vertices [N, 3] come nearer than `MARGIN_M` to a wall."""
+def require_inside(walls: Walls, name: str, vertices: Array) -> None:
+    """Raises StartError where the vertices [N, 3] of a table or a board come nearer than `MARGIN_M` to a wall."""
     lacks = np.abs(vertices[:, :2]).max(axis=0) + MARGIN_M - 0.5 * walls.size_m[:2]
     if lacks.max() > 0.0:
         size = " x ".join(f"{side:.2f}" for side in walls.size_m[:2])
         raise StartError(
-            "room_too_small", f"the table reaches {lacks.max():.2f} m beyond a room of {size} m: raise look.room.size_m"
+            "room_too_small",
+            f"the {name} reaches {lacks.max():.2f} m beyond a room of {size} m: raise look.room.size_m",
         )
 
 

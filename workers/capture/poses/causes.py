@@ -227,12 +227,11 @@ class Doubt:
 
 @dataclass(frozen=True, eq=False)
 class _Tried:
-    """An explanation as it fits: the corners as its camera reads them, and how many numbers it took."""
+    """An explanation as it fits, and the corners as its camera reads them."""
 
     explanation: Explanation
     seen: Seen
     fitted: Fitted
-    count: int
 
 
 ROUNDS, SAME = 5, 0.1
@@ -263,7 +262,7 @@ def find_doubt(
         begin = {WHOLE: start.without_lens(), best.explanation.numbers: about, (): start}
         tried = [_try(explanation, begin.get(explanation.numbers, start)) for explanation in EXPLANATIONS]
         before, variance, usual = sigma_px, left, tried[0]
-        best = min(tried, key=lambda t: t.fitted.cost / variance + t.fitted.occam + t.count * np.log(count))
+        best = min(tried, key=lambda t: t.fitted.cost / variance + t.fitted.occam + len(t.fitted.alike) * np.log(count))
         if best is usual:
             break
         about = dataclasses.replace(best.seen, poses=best.fitted.poses, shared=best.fitted.shared)
@@ -277,7 +276,7 @@ def find_doubt(
     alike = 0.25 * count * (ALIKE_PX / start.term.sigma_px[0]) ** 2  # two of a marker's eight are its place
     wanted = EXPLAINED * best.fitted.own.shape[1] * usual.fitted.cost
     if best.fitted.alike.size:
-        wanted = best.count * np.log(count) * variance * max(1.0, _scatter(best, variance)) + alike
+        wanted = len(best.fitted.alike) * np.log(count) * variance * max(1.0, _scatter(best, variance)) + alike
     return None if best is usual or gain < wanted else _doubt(best, wide, usual, start, fixed, variance, spec)
 
 
@@ -287,9 +286,8 @@ CAMERAS = 6
 
 def _try(explanation: Explanation, start: Seen) -> _Tried:
     """The explanation at its least cost; one of the camera is fitted anew about the camera that it says."""
-    seen, fields = start, explanation.fields(start)
-    fitted = fit_fields(seen.term, fields, seen.poses, seen.shared)
-    count = fields.alike.shape[2]
+    seen = start
+    fitted = fit_fields(seen.term, explanation.fields(seen), seen.poses, seen.shared)
     for _ in range(CAMERAS if explanation.numbers else 0):
         before, camera = fitted.cost, changed_camera(seen.camera, explanation.numbers, fitted.alike)
         rays = seen.rays_by(camera)
@@ -298,11 +296,10 @@ def _try(explanation: Explanation, start: Seen) -> _Tried:
         k = camera.intrinsics
         term = dataclasses.replace(seen.term, rays=rays, focal=np.array([k.fx, k.fy]))
         seen = dataclasses.replace(seen, term=term, poses=fitted.poses, shared=fitted.shared, camera=camera)
-        fields = explanation.fields(seen)
-        fitted = fit_fields(seen.term, fields, seen.poses, seen.shared)
+        fitted = fit_fields(seen.term, explanation.fields(seen), seen.poses, seen.shared)
         if abs(fitted.cost - before) < 1e-3 * before:
             break
-    return _Tried(explanation, seen, fitted, count)
+    return _Tried(explanation, seen, fitted)
 
 
 def _scatter(tried: _Tried, variance: float) -> float:
@@ -337,15 +334,10 @@ def _doubt(
     unsure_m = np.sqrt(variance * np.trace(wide.fitted.covariance[:, :3, :3], axis1=1, axis2=2))
     off, left = (float(np.sqrt(tried.fitted.cost / noise)) for tried in (usual, best))
     fits = left <= FITS
-    is_known = (
-        bool(explanation.numbers) and fits and best is not usual and bool(np.median(shift_m) > np.median(unsure_m))
-    )
-    if explanation.numbers == WHOLE:
-        is_known = is_known and spec.calibrate
-    material = (
-        max(float(np.median(shift_m / np.linalg.norm(start.poses[:, :3, 3], axis=1))), float(np.median(turn)))
-        >= MATERIAL
-    )
+    sure = best is not usual and bool(np.median(shift_m) > np.median(unsure_m))
+    is_known = fits and sure and bool(explanation.numbers) and (explanation.numbers != WHOLE or spec.calibrate)
+    shift = np.median(shift_m / np.linalg.norm(start.poses[:, :3, 3], axis=1))
+    material = bool(max(shift, np.median(turn)) >= MATERIAL)
     note, px = "", float(start.term.sigma_px[0])
     if fits:
         by = f"{1000 * np.median(shift_m):.1f} mm, {np.degrees(np.median(turn)):.2f} degrees"

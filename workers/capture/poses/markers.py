@@ -271,11 +271,8 @@ def check_depth(evidence: Evidence) -> None:
     parts, camera = [np.zeros((0, 3))], evidence.camera
     for seen, view in zip(evidence.observations, evidence.markers, strict=True):
         if view.fit is not None and fits_board(seen, view.fit.T_board_cam, camera):  # else they tell no distance
-            corners = seen.corners
-            true_z, length = (
-                transform(invert(view.fit.T_board_cam), corners.board)[:, 2],
-                np.hypot(1.0, _norm(corners.rays)),
-            )
+            corners, length = seen.corners, np.hypot(1.0, _norm(seen.corners.rays))
+            true_z = transform(invert(view.fit.T_board_cam), corners.board)[:, 2]
             parts.append(np.column_stack([corners.depth_m, true_z, length])[(corners.depth_m > 0) & (true_z > 0)])
     z, true_z, length = np.concatenate(parts).T
     if len(z) < MANY:

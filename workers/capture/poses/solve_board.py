@@ -17,21 +17,19 @@ from schemas.base import Array, Pose
 from schemas.errors import CaptureError, command_line
 from schemas.job.captures import Board
 from workers.capture.board import LARGEST, id_words, open_dictionary, opencv_poses, smallest_dictionary
-from workers.capture.board_kinds import board_of_markers, recognise_board
+from workers.capture.board_kinds import UPRIGHT, board_of_markers, recognise_board
 from workers.capture.detect import find_markers, other_dictionary, unbend_corners
 from workers.capture.folder import CaptureFolder, read_view
 from workers.capture.poses.corners import outward_motion
-from workers.capture.poses.terms import cross_matrix, moved
+from workers.capture.poses.terms import GROW_PX, cross_matrix, moved
 from workers.geometry.camera import spread_evenly
 from workers.geometry.frames import invert, transform
 from workers.geometry.pixels import rays_of_pixels
 
-SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+SQUARE = UPRIGHT - [0.5, 0.5, 0.0]
 """Corners of a tag of side 1, clockwise from the upper left, as OpenCV's IPPE_SQUARE has them."""
 ROBUST_PX = 0.3
 """Residuals beyond this count by their size alone: three times what a refined corner is off."""
-GROW_PX = 0.3
-"""Sigma of what sharpening, tone curves and spread ink add to each end of a side."""
 FLAT_M = 0.005
 """Tags whose corners are so near to a plane lie in it: sheets are not flat."""
 AMBIGUOUS_M = 0.01
@@ -60,9 +58,9 @@ class SolvedBoard:
     left_out: tuple[int, ...]
 
 
-def solve_board(folder: CaptureFolder, side_m: float, dictionary: str, border_bits: int = 1) -> SolvedBoard:
+def solve_board(folder: CaptureFolder, side_m: float, dictionary: str) -> SolvedBoard:
     """The places of all tags of a dictionary in a folder's photographs. Raises CaptureError where they do not hang together."""
-    seen = _see(folder, open_dictionary(Board(dictionary=dictionary), folder.path), border_bits)
+    seen = _see(folder, open_dictionary(Board(dictionary=dictionary), folder.path), 1)
     square = side_m * SQUARE
     tags, views = _join(seen, square)
     if len(tags) < 2 or len(views) < 3:
@@ -77,7 +75,7 @@ def solve_board(folder: CaptureFolder, side_m: float, dictionary: str, border_bi
     corners = _in_plane(np.array([transform(tags[n], square) for n in ids]), ids.index(next(iter(tags))), views)
     flat = int((np.abs(corners[..., 2]).max(axis=1) < FLAT_M).sum())
     lost = tuple(sorted({n for tags_seen in seen.values() for n in tags_seen} - set(ids)))
-    board = board_of_markers(dictionary, ids, corners, border_bits=border_bits)
+    board = board_of_markers(dictionary, ids, corners)
     return SolvedBoard(board, flat, len(views), residual_px, float(np.median(sigma)), float(sigma.max()), lost)
 
 
@@ -213,14 +211,10 @@ def _adjust(
     spread = 1.4826 * float(np.median(np.abs(residual))) * np.sqrt(residual.size / (residual.size - fit.x.size))
     covariance = spread**2 * np.linalg.pinv(fit.jac.T @ fit.jac, hermitian=True)
     places = at(fit.x)[1]
-    sigma, lever = (
-        [],
-        np.concatenate([np.tile(np.eye(3), (4, 1, 1)), -cross_matrix(square)], axis=2),
-    )  # in the tag's frame
-    for k in range(len(views), len(begun)):
-        block = slice(6 * k, 6 * k + 6)
-        sigma.append(np.sqrt(np.einsum("cij,jk,cik->c", lever, covariance[block, block], lever)))
-    return dict(zip(tags, places, strict=True)), spread, np.array(sigma)
+    lever = np.concatenate([np.tile(np.eye(3), (4, 1, 1)), -cross_matrix(square)], axis=2)  # in the tag's frame
+    blocks = [covariance[n : n + 6, n : n + 6] for n in range(6 * len(views), 6 * len(begun), 6)]
+    sigma = np.sqrt(np.einsum("cij,njk,cik->nc", lever, np.array(blocks), lever))
+    return dict(zip(tags, places, strict=True)), spread, sigma
 
 
 def _in_plane(corners: Array, first: int, views: Mapping[int, Pose]) -> Array:

@@ -150,12 +150,8 @@ class Rows:
     def of_view(self, number: int) -> tuple[Array, Array, Array]:
         """(J [n, 6], residual [n], by_shared [n, S]) of the rows of one view alone, times the roots of their weights."""
         chosen = (self.view[:, 0] == number) & (self.view[:, -1] == number)
-        root = np.sqrt(self.weight[chosen])
-        return (
-            root[:, None] * self.by_view[chosen, 0],
-            root * self.residual[chosen],
-            root[:, None] * self.by_shared[chosen],
-        )
+        root = np.sqrt(self.weight[chosen])[:, None]
+        return root * self.by_view[chosen, 0], root[:, 0] * self.residual[chosen], root * self.by_shared[chosen]
 
 
 class Term(Protocol):

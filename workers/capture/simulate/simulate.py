@@ -27,6 +27,7 @@ from schemas.job.views import DepthNoise, Render
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
 from schemas.scene.view import Camera
+from workers.assets.look.surroundings import require_camera_inside
 from workers.capture.folder import (
     CaptureFile,
     stored_depth,
@@ -35,6 +36,7 @@ from workers.capture.folder import (
     write_view,
 )
 from workers.capture.simulate.studio import (
+    Around,
     Studio,
     assumed_device,
     build_studio,
@@ -51,7 +53,7 @@ from workers.geometry.zbuffer import register_depth
 from workers.render.pathtraced import draw_view
 from workers.render.raster.gbuffer import shared_renderer
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.effects import CAPTURE_EFFECTS, plan_capture
+from workers.scene.effects import CAPTURE_EFFECTS
 from workers.scene.sensor import add_noise, expose, sense_depth
 
 SAMPLES = 9
@@ -238,6 +240,7 @@ def photograph(studio: Studio, number: int, T_board_cam: Pose) -> tuple[Captured
 def take_light(studio: Studio, number: int, T_world_cam: Pose) -> Array:
     """[H, W, 3]: linear light of one exposure; T_world_cam is the pose at its middle, and of its middle row."""
     k, simulate = studio.rig.color, studio.simulate
+    require_camera_inside(studio.walls, "capture's", Camera(k, T_world_cam))
     blur, rolling = (
         AT_REST if time_s is None else draw_motion(time_s, studio.chance.stream(Stream.MOTION, number))
         for time_s in (simulate.motion_blur, simulate.rolling_shutter)
@@ -351,22 +354,19 @@ def write_held_out(studio: Studio, board: Board, target: Array, path: Path) -> N
 
 
 def simulate_capture(
-    simulate: Simulate, board: Board, asset: Asset, chance: SceneChance, path: Path, effects: EffectPlan | None = None
+    simulate: Simulate, board: Board, asset: Asset, chance: SceneChance, path: Path, around: Around | None = None
 ) -> CaptureTruth:
     """Photograph `asset` on the board and write the folder of a capture, with truth/, to `path`, a new or empty folder.
 
-    `chance` decides all that is random: the same arguments write the same bytes. `effects` is the plan for these settings
-    unless given. camera.json comes last, so that a capture that was cut off cannot be mistaken for a whole one. Raises
-    CaptureError where the folder has files or the lens cannot be.
+    `chance` decides all that is random: the same arguments write the same bytes. `around`: what stands around the board.
+    camera.json comes last, so that a capture that was cut off cannot be mistaken for a whole one. Raises CaptureError where the
+    folder has files or the lens cannot be, StartError and ViewError where the room is too small for the board or a camera.
     """
     path.mkdir(parents=True, exist_ok=True)
     if any(path.iterdir()):
         raise CaptureError("exists", f"{path} holds files already: name a new or an empty folder")
-    plan = plan_capture(simulate) if effects is None else effects
-    # Every effect that the plan does not run is off.
-    simulate = simulate.model_copy(update=dict.fromkeys(name for name in CAPTURE_EFFECTS if not plan.runs(name)))
     thing = Placed(REGION_FIRST_OBJECT, asset.shape, place_object(asset, chance.stream(Stream.START)))
-    studio = build_studio(simulate, board, thing, plan, chance)
+    studio = build_studio(simulate, board, thing, chance, around)
     target = thing.T_world_shape[:3, 3]
     poses = plan_path(simulate, target, chance.stream(Stream.CAMERA))
     for number, T_board_cam in enumerate(poses):
@@ -382,7 +382,7 @@ def simulate_capture(
         lens=simulate.distortion,
     )
     write_held_out(studio, board, target, path / TRUTH / HELD_OUT)
-    write_truth(path, truth, asset, plan.ran, plan.skipped)
+    write_truth(path, truth, asset, studio.effects, studio.surroundings)
     about = CaptureFile(name=f"{asset.category}-{chance.scene_id:05d}", category=asset.category, licence=asset.licence)
     camera = CaptureCamera(studio.rig.color, opencv_lens(simulate.distortion), DEPTH_UNITS_PER_M)
     write_description(path, about, camera, board)

@@ -1,6 +1,7 @@
 """What a virtual capture photographs, by what and from where: the object on its board, the Azure Kinect, the camera's path."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -11,8 +12,9 @@ from schemas.base import Array, Pose, frozen_array
 from schemas.capture import DepthCamera
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, RegistrationError, Simulate
+from schemas.job.look import Look
 from schemas.job.views import Distortion
-from schemas.scene.scene import EffectPlan, Placed
+from schemas.scene.scene import EffectPlan, Placed, Walls
 from schemas.scene.shape import (
     REGION_FLOOR,
     REGION_TABLE,
@@ -23,12 +25,16 @@ from schemas.scene.shape import (
     Shape,
 )
 from schemas.scene.view import Intrinsics
+from workers.assets.catalogue import Catalogue
 from workers.assets.look.appearance import draw_appearance
+from workers.assets.look.surroundings import require_inside
 from workers.capture.board import TOUCHING_M, board_geometry, marker_cells, marker_corners
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, pose, rotation_about, translation
 from workers.geometry.pixels import undistort
 from workers.scene.chance import SceneChance, Stream
+from workers.scene.draw.surround import enclose
+from workers.scene.effects import plan_capture
 
 
 def place_object(asset: Asset, rng: np.random.Generator) -> Pose:
@@ -283,13 +289,17 @@ FINER = 3.0
 """The floor's pattern is so many times as fine as in a scene: a table top is looked at from nearby."""
 
 
+Around = tuple[Look, Catalogue]
+"""What the job puts around the board, and where its pictures are."""
+
+
 @dataclass(frozen=True, eq=False)
 class Studio:
     """What is photographed and by what; the board lies on the floor of the world, z up.
 
     `simulate` has the effects that run, and `effects` is the plan of drawing. T_world_board [4, 4]: the board frame lies on top
     of the board. `drawn_color` is the pinhole camera that the colour image
-    is drawn with: `rig.color`, or a wider one that `lookup` bends into it.
+    is drawn with: `rig.color`, or a wider one that `lookup` bends into it. `walls` of a room, and what was drawn of `look`.
     """
 
     simulate: Simulate
@@ -301,27 +311,39 @@ class Studio:
     chance: SceneChance
     drawn_color: Intrinsics
     lookup: tuple[Array, Array] | None
+    walls: Walls | None
+    surroundings: Mapping[str, object]
 
 
-def build_studio(simulate: Simulate, board: Board, thing: Placed, effects: EffectPlan, chance: SceneChance) -> Studio:
-    """The floor, the board on it, and `thing`, posed in the board frame, in their light. Raises CaptureError for the lens."""
+def build_studio(
+    simulate: Simulate, board: Board, thing: Placed, chance: SceneChance, around: Around | None = None
+) -> Studio:
+    """The floor, the board on it, and `thing`, posed in the board frame, in their light.
+
+    Raises CaptureError for the lens, StartError where the board does not fit into the room.
+    """
     floor, appearance = draw_appearance(chance.stream(Stream.APPEARANCE), "raster")
     parts = (part if part.uv is None else replace(part, uv=frozen_array(FINER * part.uv)) for part in floor.parts)
+    floor, walls, surroundings = replace(floor, parts=tuple(parts)), None, dict[str, object]()
+    if around is not None:
+        floor, walls, surroundings = enclose(*around, chance, floor, appearance)
     T_world_board = frozen_array(translation(0.0, 0.0, THICKNESS_M))
     printed, rig = true_board(board, simulate), make_rig(simulate.image_scale)
-    things = [
-        Placed(REGION_FLOOR, replace(floor, parts=tuple(parts)), frozen_array(np.eye(4))),
-        Placed(REGION_TABLE, board_body(printed), T_world_board),
-        replace(thing, T_world_shape=frozen_array(T_world_board @ thing.T_world_shape)),
-    ]
+    body, things = board_body(printed), [Placed(REGION_FLOOR, floor, frozen_array(np.eye(4)))]
+    if walls is not None:
+        require_inside(walls, "board", body.vertices)
+        things.append(Placed(REGION_FLOOR, walls.shape, frozen_array(np.eye(4))))
+    things.append(Placed(REGION_TABLE, body, T_world_board))
     if simulate.hidden_markers is not None:
         slips = cover_markers(simulate.hidden_markers, printed, chance.stream(Stream.HIDDEN_MARKERS))
-        things[2:2] = [] if slips is None else [Placed(REGION_TABLE, slips, T_world_board)]
+        things += [] if slips is None else [Placed(REGION_TABLE, slips, T_world_board)]
+    things.append(replace(thing, T_world_shape=frozen_array(T_world_board @ thing.T_world_shape)))
     drawn, lookup = rig.color, None
     if simulate.distortion is not None:
         drawn, *places = pinhole_lookup(simulate.distortion, rig.color)
         lookup = places[0], places[1]
-    return Studio(simulate, effects, tuple(things), appearance, rig, T_world_board, chance, drawn, lookup)
+    light = appearance, rig, T_world_board, chance, drawn, lookup
+    return Studio(simulate, plan_capture(simulate), tuple(things), *light, walls, surroundings)
 
 
 VIEWS_PER_TURN = 14

@@ -52,10 +52,8 @@ def describe_grazing(mesh: Mesh, cameras: Mapping[int, Camera]) -> str | None:
     advice = _advice(caster, (points[grazing], normals[grazing]), cameras, least) if grazing.sum() >= least else None
     if advice is None:
         return None
-    words = (
-        f"{grazing.sum() / seen.sum():.0%} of the surface that the views see was seen only at more than {GRAZING_DEG:g}"
-    )
-    return f"{words} degrees from its normal, and what goes on from there may be missing: {advice}"
+    words = f"{grazing.sum() / seen.sum():.0%} of the surface that the views see was seen only at more than"
+    return f"{words} {GRAZING_DEG:g} degrees from its normal, and what goes on from there may be missing: {advice}"
 
 
 def _advice(caster: Caster, at: tuple[Array, Array], cameras: Mapping[int, Camera], least: float) -> str | None:

@@ -17,9 +17,9 @@ from schemas.base import Array, Pose
 from schemas.errors import CaptureError
 from schemas.job.captures import Board, Fusion
 from schemas.scene.shape import Mesh
-from schemas.scene.view import Camera, Intrinsics
+from schemas.scene.view import Camera
 from workers.capture.board import TOUCHING_M, board_geometry
-from workers.capture.surface.posed_view import PosedView
+from workers.capture.surface.posed_view import PosedView, pinhole_rays
 from workers.geometry.jit import compiled
 from workers.geometry.mesh import edge_keys
 from workers.geometry.zbuffer import draw_depth
@@ -113,7 +113,7 @@ class ObjectRegion(Ground):
         quiet = np.zeros_like(z)
         if depth_m.size:
             quiet = cv2.medianBlur(np.ascontiguousarray(depth_m), MEDIAN_PX).astype(np.float64)
-        rays = _pixel_rays(camera.intrinsics, z.shape)
+        rays = pinhole_rays(camera.intrinsics, z.shape)
         # The height of a pixel is z (up . ray) + above, with `up` the plane's upward normal in camera axes; it is 0 on the plane.
         up, above = T[2, :3] - a * T[0, :3] - b * T[1, :3], T[2, 3] - a * T[0, 3] - b * T[1, 3] - c
         along = up[0] * rays[0] + up[1] * rays[1] + up[2]
@@ -136,12 +136,6 @@ class ObjectRegion(Ground):
 def _cells_at(places: tuple[Array, Array], corner: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     i, j = (np.floor((at - first) / CELL_M).astype(np.int64) for at, first in zip(places, corner, strict=True))
     return i, j
-
-
-def _pixel_rays(k: Intrinsics, shape: tuple[int, ...], stride: int = 1) -> tuple[Array, Array]:
-    """(x [1, w], y [h, 1]) at z = 1 of every `stride`-th pixel of an image [H, W]."""
-    rows, columns = (np.arange(stride // 2, side, stride, dtype=np.float64) + 0.5 for side in shape)
-    return ((columns - k.cx) / k.fx)[None, :], ((rows - k.cy) / k.fy)[:, None]
 
 
 def _to_board(T: Pose, rays: tuple[Array, Array], z: Array) -> tuple[Array, Array, Array]:
@@ -209,7 +203,7 @@ def _heights(views: Sequence[PosedView], half: Array) -> tuple[NDArray[np.int32]
         stride = max(1, int(np.sqrt(k.width * k.height / SAMPLES)))
         at = np.s_[stride // 2 :: stride, stride // 2 :: stride]
         mask = np.ones((1, 1), np.bool_) if view.mask is None else view.mask[at]
-        pictures = view.depth_m[at], _pixel_rays(k, view.depth_m.shape, stride), mask
+        pictures = view.depth_m[at], pinhole_rays(k, view.depth_m.shape, stride), mask
         _count_heights(pictures, view.depth_camera.T_world_cam, -half, low_bins, tall_bins)
     return low_bins, tall_bins
 

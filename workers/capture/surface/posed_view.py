@@ -11,7 +11,7 @@ from schemas.capture import CaptureCamera, CapturedView, DepthCorrection
 from schemas.errors import CaptureError
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, Mesh, Part, Shape
-from schemas.scene.view import Camera
+from schemas.scene.view import Camera, Intrinsics
 from workers.door.recordings.pictures import pinhole_maps, remap
 from workers.geometry.camera import project
 from workers.geometry.frames import invert, transform
@@ -69,6 +69,12 @@ def distort_mask(mask: NDArray[np.bool_], camera: CaptureCamera) -> NDArray[np.b
     k, rays = camera.intrinsics, pixel_rays(camera.intrinsics, camera.lens)
     straight = (rays * [k.fx, k.fy] + [k.cx_opencv, k.cy_opencv]).astype(np.float32)
     return remap(mask.view(np.uint8), [straight[..., 0], straight[..., 1]], between=False).view(np.bool_)
+
+
+def pinhole_rays(k: Intrinsics, shape: tuple[int, ...], stride: int = 1) -> tuple[Array, Array]:
+    """(x [1, w], y [h, 1]) at z = 1 of the centre of every `stride`-th pixel of an image [H, W]."""
+    rows, columns = (np.arange(stride // 2, side, stride, dtype=np.float64) + 0.5 for side in shape)
+    return ((columns - k.cx) / k.fx)[None, :], ((rows - k.cy) / k.fy)[:, None]
 
 
 CLEAR_M = 1e-5

@@ -18,8 +18,9 @@ from schemas.errors import CaptureError
 from schemas.job.captures import Synthesis
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera, Intrinsics
-from workers.capture.surface.posed_view import PosedView, project_pixels, sample_pixels
+from workers.capture.surface.posed_view import PosedView, pinhole_rays, project_pixels, sample_pixels
 from workers.capture.surface.tsdf import FittedDepth
+from workers.geometry.camera import unproject
 from workers.geometry.frames import invert, transform
 from workers.geometry.jit import compiled
 from workers.geometry.zbuffer import corner_weights, draw_depth, draw_triangles
@@ -68,10 +69,9 @@ def prepare_source(view: PosedView, fitted: FittedDepth) -> Source:
     """The source of a view whose depth is fitted in the whole image."""
     k, rgb = view.camera.intrinsics, view.rgb
     if not np.array_equal(view.camera.T_world_cam, view.depth_camera.T_world_cam):
-        known, points = _lift(fitted.inverse, k)
-        points = transform(view.depth_camera.T_world_cam, points)
+        points = transform(view.depth_camera.T_world_cam, _lift(fitted.inverse, k))
         rgb = np.zeros_like(rgb)
-        rgb[known] = sample_pixels(view.rgb, np.arange(256.0), view.camera, points)[0] + 0.5
+        rgb[fitted.inverse > 0.0] = sample_pixels(view.rgb, np.arange(256.0), view.camera, points)[0] + 0.5
     width = max(3, round(FEATHER_PX * k.fx / 912.0)) | 1
     inner = cv2.blur((fitted.inverse > 0.0).astype(np.float32), (width, width), borderType=cv2.BORDER_CONSTANT)
     known = np.clip(2.0 * inner - 1.0, 0.02, 1.0)
@@ -81,18 +81,12 @@ def prepare_source(view: PosedView, fitted: FittedDepth) -> Source:
 
 
 def color_depth(view: PosedView) -> NDArray[np.float32]:
-    """[H, W] float32: a view's depth in its colour camera, drawn anew from there where its depth camera stands elsewhere."""
+    """[H, W] float32: a view's depth as measured, in its colour camera; drawn anew where its depth camera stands elsewhere."""
     if np.array_equal(view.camera.T_world_cam, view.depth_camera.T_world_cam):
         return view.depth_m
-    return move_depth(view.depth_m, view.depth_camera, view.camera)
-
-
-def move_depth(depth_m: NDArray[np.float32], source: Camera, target: Camera) -> NDArray[np.float32]:
-    """[H, W] float32: a depth image as another camera nearby has it, as it was measured; 0 where it shows nothing."""
-    inverse = np.divide(1.0, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0.0)
-    fitted = FittedDepth(inverse, np.ones_like(inverse))
-    blank = np.zeros((*depth_m.shape, 3), np.uint8)
-    layer = warp(Source(0, source, fitted, blank, np.ones_like(inverse)), target)
+    inverse = np.divide(1.0, view.depth_m, out=np.zeros_like(view.depth_m), where=view.depth_m > 0.0)
+    ones = np.ones_like(inverse)
+    layer = warp(Source(view.number, view.depth_camera, FittedDepth(inverse, ones), view.rgb, ones), view.camera)
     return np.where(layer.weight > 0.0, layer.depth_m, np.float32(0.0))
 
 
@@ -108,21 +102,19 @@ def warp(source: Source, camera: Camera, factor: float = 1.0) -> Layer:
     return Layer(depth.astype(np.float32), *painted)
 
 
-def _lift(inverse: NDArray[np.float32], k: Intrinsics) -> tuple[NDArray[np.bool_], Array]:
-    """(pixels [h, w] that have depth, their points [N, 3] in camera coordinates)."""
+def _lift(inverse: NDArray[np.float32], k: Intrinsics) -> Array:
+    """[N, 3]: the points, in camera coordinates, of the pixels that have depth."""
     rows, columns = np.nonzero(inverse > 0.0)
-    z = 1.0 / inverse[rows, columns].astype(np.float64)
-    points = np.stack([(columns + 0.5 - k.cx) / k.fx * z, (rows + 0.5 - k.cy) / k.fy * z, z], axis=1)
-    return inverse > 0.0, points
+    return unproject(rows, columns, 1.0 / inverse[rows, columns].astype(np.float64), k)
 
 
 def _carry(inverse: NDArray[np.float32], source: Camera, target: Camera) -> tuple[NDArray[np.float32], ...]:
     """(u and v [h * w, 2], z [h * w]): pixels of the target with centres on integers; z is 0 where nothing is in front of it."""
-    known, points = _lift(inverse, source.intrinsics)
     m, T = target.intrinsics, invert(target.T_world_cam) @ source.T_world_cam
-    seen = project_pixels(points, T, (m.fx, m.fy, m.cx, m.cy))
+    seen = project_pixels(_lift(inverse, source.intrinsics), T, (m.fx, m.fy, m.cx, m.cy))
     pixels, depth = np.zeros((inverse.size, 2), np.float32), np.zeros(inverse.size, np.float32)
-    pixels[known.ravel()], depth[known.ravel()] = seen[:, :2] - 0.5, seen[:, 2]
+    known = inverse.ravel() > 0.0
+    pixels[known], depth[known] = seen[:, :2] - 0.5, seen[:, 2]
     return pixels, depth
 
 
@@ -259,8 +251,8 @@ def synthesize_view(sources: Sequence[Source], camera: Camera, body: Mesh) -> Sy
 def _agrees(depth_m: NDArray[np.float32], body_m: Array, camera: Camera) -> NDArray[np.bool_]:
     """[H, W] bool: depth that is the body's, which may be a pixel off; beside it, the board's or behind, or a wider thing's."""
     k, T, (height, width) = camera.intrinsics, camera.T_world_cam, depth_m.shape
-    x, y = (np.arange(width) + 0.5 - k.cx) / k.fx, (np.arange(height) + 0.5 - k.cy) / k.fy
-    height_m = depth_m * (T[2, 0] * x[None, :] + T[2, 1] * y[:, None] + T[2, 2]) + T[2, 3]
+    x, y = pinhole_rays(k, depth_m.shape)
+    height_m = depth_m * (T[2, 0] * x + T[2, 1] * y + T[2, 2]) + T[2, 3]
     framed, on_body, drawn = np.pad(body_m, 1), np.zeros(depth_m.shape, np.bool_), body_m > 0.0
     for i, j in np.ndindex(3, 3):
         on_body |= np.abs(framed[i : i + height, j : j + width] - depth_m) < AGREE_M

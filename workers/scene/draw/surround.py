@@ -6,13 +6,13 @@ from dataclasses import replace
 
 from schemas.job.job import Job
 from schemas.job.look import Look, Surface
-from schemas.scene.scene import ScenePlan
+from schemas.scene.scene import ScenePlan, Walls
 from schemas.scene.shape import Appearance, Shape
 from workers.assets.catalogue import Catalogue
 from workers.assets.look.environment import relight
 from workers.assets.look.lights import describe_lights, draw_environment, draw_lights
 from workers.assets.look.pictures import load_picture
-from workers.assets.look.surroundings import Coat, build_room, cover_floor, cover_table, draw_coat, require_table_inside
+from workers.assets.look.surroundings import Coat, build_room, cover_floor, cover_table, draw_coat, require_inside
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.draw.plan import add_clutter
 
@@ -32,21 +32,16 @@ def surround(job: Job, look: Look, catalogue: Catalogue, chance: SceneChance, pl
     plan = replace(plan, appearance=appearance)
     if plan.ground is not None:
         ground = plan.ground
-        if look.floor is not None:
-            floor, coat = lay_floor(look.floor, catalogue, chance, ground.floor)
-            drawn |= _named("floor", coat)
-            ground = replace(ground, floor=floor)
+        floor, walls, around = enclose(look, catalogue, chance, ground.floor, appearance)
+        drawn |= around
+        if walls is not None:
+            require_inside(walls, "table", ground.table.mesh.vertices)
+        ground = replace(ground, floor=floor, walls=walls)
         if look.table is not None:
             rng, pictures = chance.stream(Stream.SURROUNDINGS, TABLE), catalogue.pictures.get("look.table.folder", ())
             coat = draw_coat(look.table, pictures, rng, SMOOTH)
             drawn |= _named("table", coat)
             ground = replace(ground, cover=cover_table(ground.table.asset, coat))
-        if look.room is not None:
-            towards = plan.appearance.lights[0].direction
-            walls = build_room(look.room, towards, chance.stream(Stream.SURROUNDINGS, ROOM))
-            require_table_inside(walls, ground.table.mesh.vertices)
-            drawn["room_m"] = walls.size_m.tolist()
-            ground = replace(ground, walls=walls)
         plan = replace(plan, ground=ground)
         if look.clutter is not None:
             plan = add_clutter(job, look.clutter, catalogue, chance, plan)
@@ -70,6 +65,20 @@ def light_scene(
         around = draw_environment(chance.stream(Stream.ENVIRONMENT), look.environment, catalogue.maps)
         drawn |= {"environment": around.source.name, "environment_deg": math.degrees(around.turn_rad)}
     return relight(base, lights, around, shown), drawn
+
+
+def enclose(
+    look: Look, catalogue: Catalogue, chance: SceneChance, floor: Shape, appearance: Appearance
+) -> tuple[Shape, Walls | None, dict[str, object]]:
+    """The floor and the room that are asked for, with its window towards the key light, and what was drawn of both."""
+    walls, drawn = None, dict[str, object]()
+    if look.floor is not None:
+        floor, coat = lay_floor(look.floor, catalogue, chance, floor)
+        drawn |= _named("floor", coat)
+    if look.room is not None:
+        walls = build_room(look.room, appearance.lights[0].direction, chance.stream(Stream.SURROUNDINGS, ROOM))
+        drawn["room_m"] = walls.size_m.tolist()
+    return floor, walls, drawn
 
 
 def lay_floor(surface: Surface, catalogue: Catalogue, chance: SceneChance, floor: Shape) -> tuple[Shape, Coat]:
