@@ -124,7 +124,8 @@ def wound_wrongly(solid: Solid) -> int:
     large = area > 1e-10
     normals, middles = across[large] / area[large, None], (a + b + c)[large] / 3.0
     inside, before = (
-        winding_of_closed(middles + side * 2e-7 * normals, Mesh(solid.vertices, solid.faces.astype(np.int32))) for side in (-1.0, 1.0)
+        winding_of_closed(middles + side * 2e-7 * normals, Mesh(solid.vertices, solid.faces.astype(np.int32)))
+        for side in (-1.0, 1.0)
     )
     return int(((inside != 1) | (before != 0)).sum())
 
