@@ -22,6 +22,7 @@ from typing import Any, Final
 
 import guesses
 import numpy as np
+import occupancy
 import pyarrow as pa
 import pyarrow.parquet as pq
 import trimesh
@@ -110,7 +111,7 @@ def find_shapes(dataset: Dataset) -> Predictor:
         for region in regions_of(pair):
             mask = silhouette(pair, region)
             known = masks.get(pair.input.regions[region]["category"]) or list(chain(*masks.values()))
-            _, pose_id, other = max(known, key=lambda row: (overlap(row[0], mask), -row[1]))
+            _, pose_id, other = max(known, key=lambda row: (occupancy.iou(row[0], mask), -row[1]))
             shapes[region] = mesh_of(dataset.pair(pose_id), other)
         volumes = {region: inside(pair.samples(region)["volume_points"], mesh) for region, mesh in shapes.items()}
         return Prediction(shapes=shapes, volumes=volumes)
@@ -126,12 +127,6 @@ def silhouette(pair: Pair, region: int) -> NDArray[np.bool_]:
         at = places - (places.min(axis=0) + places.max(axis=0)) // 2 + SILHOUETTE_PX // 2
         mask[tuple(at[((at >= 0) & (at < SILHOUETTE_PX)).all(axis=1)].T)] = True
     return mask
-
-
-def overlap(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
-    """Intersection over union of two masks; nan where both are empty."""
-    union = a | b
-    return float((a & b).sum() / union.sum()) if union.any() else float("nan")
 
 
 def inside(points: NDArray, mesh: trimesh.Trimesh) -> NDArray[np.bool_]:
@@ -152,14 +147,21 @@ def train_depth(dataset: Dataset, noise: bool = False) -> Predictor:
 
 
 def train_volume(dataset: Dataset) -> Predictor:
-    """The network of train_occupancy.py."""
+    """The network of train_occupancy.py; nothing is inside an object whose patch leaves the image."""
     import train_mirror_depth as depth
     import train_occupancy as volume
 
     fix_numbers()
     net = volume.OccupancyNet()
     depth.train(net, volume.load(dataset.place), volume.EPOCHS, volume.loss_of)
-    return volume.predictor(net)
+
+    def predict(pair: Pair) -> Prediction:
+        examples = {region: occupancy.make_example(pair, region, uniform=False) for region in regions_of(pair)}
+        none = {region: np.zeros(len(pair.samples(region)["volume_points"]), bool) for region in examples}
+        answers = {region: volume.answer(net, example) for region, example in examples.items() if example}
+        return Prediction(volumes=none | answers)
+
+    return predict
 
 
 def fix_numbers() -> None:

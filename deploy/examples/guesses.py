@@ -173,32 +173,40 @@ def complete_by_symmetry(pair: Pair) -> Prediction:
         mask = np.zeros(seen_m.shape, bool)
         mask[rows.clip(0, mask.shape[0] - 1), columns.clip(0, mask.shape[1] - 1)] = True
         tree, best, least = cKDTree(points), points, np.inf
-        for normal, offset_m in upright_planes(some, up):
-            reflected = reflect(some, normal, offset_m)
-            cost = NEARNESS * tree.query(reflected)[0].mean()
+        for reflected in reflections(some, up):
+            cost = NEARNESS * tree.query(reflected.points)[0].mean()
             if cost < least:
-                there = mirror_depth.transform(T_input_mirror, reflected)
+                there = mirror_depth.transform(T_input_mirror, reflected.points)
                 cost += behind_what_is_seen(view, there, seen_m, mask)
                 if cost < least:
-                    best, least = reflect(points, normal, offset_m), cost
+                    best, least = reflected.all_of(points), cost
         return np.concatenate([points, best])
 
     return spread(pair, complete)
 
 
-def reflect(points: NDArray, normal: NDArray, offset_m: float) -> NDArray:
+@dataclass(frozen=True, eq=False)
+class Reflection:
     """Points [N, 3] reflected at the plane normal . x = offset_m."""
-    return points - 2.0 * np.outer(points @ normal - offset_m, normal)
+
+    points: NDArray
+    normal: NDArray
+    offset_m: float
+
+    def all_of(self, points: NDArray) -> NDArray:
+        """Other points reflected at the same plane."""
+        return points - 2.0 * np.outer(points @ self.normal - self.offset_m, self.normal)
 
 
-def upright_planes(points: NDArray, up: NDArray) -> Iterator[tuple[NDArray, float]]:
-    """(normal, offset_m) of upright planes of all directions, through points [N, 3] and beside them by their width."""
+def reflections(points: NDArray, up: NDArray) -> Iterator[Reflection]:
+    """Points [N, 3] reflected at upright planes of all directions, through them and beside them by their width."""
     level = np.linalg.svd(up[None])[2][1:]
     for angle in np.arange(ANGLES) * np.pi / ANGLES:
         normal = np.cos(angle) * level[0] + np.sin(angle) * level[1]
         low, high = np.percentile(points @ normal, [1, 99])
         for offset_m in np.linspace(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, SHIFTS):
-            yield normal, float(offset_m)
+            plane = Reflection(points, normal, float(offset_m))
+            yield Reflection(plane.all_of(points), normal, float(offset_m))
 
 
 def behind_what_is_seen(view: View, points: NDArray, seen_m: NDArray, mask: NDArray[np.bool_]) -> float:

@@ -126,8 +126,11 @@ def crop_corner(view: View, points: NDArray[np.float64]) -> tuple[int, int] | No
 def splat(view: View, points: NDArray[np.float64], corner: tuple[int, int]) -> Image:
     """The nearest depth of points that fill 3 x 3 pixels each, 0 where there is none."""
     image = np.full(CROP, np.inf, np.float32)
-    for at, inside in squares_of(*pixels_of(view, points), corner):
-        np.minimum.at(image, at, points[inside, 2].astype(np.float32))
+    rows, columns = pixels_of(view, points)
+    for dy, dx in np.ndindex(3, 3):
+        y, x = rows - corner[0] + dy - 1, columns - corner[1] + dx - 1
+        inside = (y >= 0) & (x >= 0) & (y < CROP[0]) & (x < CROP[1])
+        np.minimum.at(image, (y[inside], x[inside]), points[inside, 2].astype(np.float32))
     return np.where(np.isfinite(image), image, np.float32(0))
 
 
@@ -136,19 +139,11 @@ def splat_values(view: View, points: NDArray, values: NDArray, corner: tuple[int
     image = np.zeros((*CROP, 3), np.float32)
     rows, columns = pixels_of(view, points)
     order = np.argsort(-points[:, 2], kind="stable")
-    for at, inside in squares_of(rows[order], columns[order], corner):
-        image[at] = values[order][inside] / 255
-    return image
-
-
-def squares_of(
-    rows: NDArray, columns: NDArray, corner: tuple[int, int]
-) -> Iterator[tuple[tuple[NDArray, NDArray], NDArray]]:
-    """((row, column) in the crop, which points) for each place in squares of 3 x 3 about the pixels of points."""
     for dy, dx in np.ndindex(3, 3):
-        y, x = rows - corner[0] + dy - 1, columns - corner[1] + dx - 1
+        y, x = rows[order] - corner[0] + dy - 1, columns[order] - corner[1] + dx - 1
         inside = (y >= 0) & (x >= 0) & (y < CROP[0]) & (x < CROP[1])
-        yield (y[inside], x[inside]), inside
+        image[y[inside], x[inside]] = values[order][inside] / 255
+    return image
 
 
 def close_holes(depth: Image) -> Image:

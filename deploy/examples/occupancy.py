@@ -1,4 +1,4 @@
-"""What an occupancy network may know of an object from one view, where it is asked, and the answers.
+"""What an occupancy network may know of an object from one view, where it is asked, the answers, baselines and the score.
 
 The network's frame stands on the table: z is up and 0 at the table top, x is level and points away from the camera, and
 x = y = 0 at the median of the object's seen points. Its unit is SCALE_M. A stored sample p, metres in the object's frame,
@@ -37,13 +37,16 @@ class Example:
     """One pair in the network's frame and unit.
 
     seen [SEEN, 3] float32: points of the input view. queries [M, FEATURES] float32: where is asked, and `shadow_of` of that
-    place and of the same after half a turn. inside [M]: the truth. M are all stored samples, or those that are uniform in the
-    object's box times 1.05: those about its surface lie nearer to it than the noise of depth.
+    place and of the same after half a turn. inside [M]: the truth. Baselines [M]: shadow, all that is behind the seen
+    surface; turned, what is so after half a turn as well. M are all stored samples, or those that are uniform in the object's
+    box times 1.05: those about its surface lie nearer to it than the noise of depth.
     """
 
     seen: NDArray[np.float32]
     queries: NDArray[np.float32]
     inside: Flags
+    shadow: Flags
+    turned: Flags
 
 
 def make_example(pair: Pair, region: int = REGION_FIRST_OBJECT, uniform: bool = True) -> Example | None:
@@ -66,10 +69,13 @@ def make_example(pair: Pair, region: int = REGION_FIRST_OBJECT, uniform: bool = 
     front = np.where(mask, close_holes(np.where(mask, depth, np.float32(0))), np.float32(0))
     T_cam_net = np.asarray(np.linalg.inv(T_net_world @ view.T_world_cam), np.float64)
     shadows = [shadow_of(view, front, transform(T_cam_net, places)) for places in (points, half_turn(points, seen))]
+    shadow, other = ((behind[:, 0] > 0) & (points[:, 2] > 0) for behind in shadows)
     return Example(
         pick(seen, SEEN, np.random.default_rng(pair.pose_id)).astype(np.float32),
         np.concatenate([points, *shadows], axis=1).astype(np.float32),
         samples["volume_occupancy"][chosen] > 0,
+        shadow,
+        shadow & other,
     )
 
 
@@ -103,3 +109,9 @@ def shadow_of(view: Pixels, front: NDArray[np.float32], points: Points) -> Point
     behind = points[:, 2] - depth
     maps = [np.clip(behind / unit, -3, 3) for unit in (SCALE_M, WALL_M)]
     return np.stack([*maps, np.ones(len(points))], axis=1) * (depth > 0)[:, None]
+
+
+def iou(predicted: Flags, inside: Flags) -> float:
+    """Intersection over union of two volumes, by samples [M] that are uniform in the box; nan where both are empty."""
+    union = predicted | inside
+    return float((predicted & inside).sum() / union.sum()) if union.any() else float("nan")

@@ -75,9 +75,7 @@ def make(job_file: Path, gate_mm: float) -> None:
         names = [instance_id(category, source.seed, number) for number in range(source.instances)]
         if job.assets.split.of(names[0]) == "unseen":
             continue
-        assets = [
-            make_asset(category, source, number, job.assets.density_of(category)) for number in range(source.instances)
-        ]
+        assets = [make_asset(category, source, number, job.assets.density_kg_m3) for number in range(source.instances)]
         sampled = [sample(asset.shape.vertices, asset.shape.faces) for asset in assets]
         apart_mm = np.full((len(names), len(names)), np.inf)
         for a, b in zip(*np.tril_indices(len(names), -1), strict=True):

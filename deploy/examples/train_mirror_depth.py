@@ -160,15 +160,8 @@ def predictor(net: Net) -> Predictor:
     return predict_pair
 
 
-def learn(
-    about: str,
-    epochs: int,
-    network: Callable[[], nn.Module],
-    load: Callable[[str], dict[str, Tensor]] = load,
-    loss_of: Loss = loss_of,
-    predictor: Callable[[Any], Predictor] = predictor,
-) -> None:
-    """Reads the command line, trains a network, and keeps it and its predictions."""
+def read_options(about: str, epochs: int) -> argparse.Namespace:
+    """The words of the command line: place, epochs, seed (which is set), out."""
     parser = argparse.ArgumentParser(description=about.splitlines()[0])
     parser.add_argument("place", metavar="DATASET", help="a folder, or a bucket")
     parser.add_argument("--epochs", type=int, default=epochs, help=f"default: {epochs}")
@@ -176,20 +169,36 @@ def learn(
     parser.add_argument("--out", type=Path, help="folder for network.pt and predictions")
     options = parser.parse_args()
     torch.manual_seed(options.seed)
-    data, net = load(options.place), network()
+    return options
+
+
+def tell_size(net: nn.Module, data: dict[str, Tensor]) -> None:
+    """Print how much is learnt from how much."""
     pairs, weights = len(next(iter(data.values()))), sum(p.numel() for p in net.parameters())
     print(f"{pairs} training pairs, {weights / 1e3:.0f} thousand weights", flush=True)
-    train(net, data, options.epochs, loss_of)
-    if options.out is None:
-        return
-    options.out.mkdir(parents=True, exist_ok=True)
-    kept = {"weights": net.state_dict(), "epochs": options.epochs, "seed": options.seed}
-    torch.save(kept, options.out / "network.pt")
-    folder, predict = options.out / "predictions", predictor(net)
-    for pair in pairs_of_split(open_dataset(options.place), "test"):
-        write(folder, pair, predict(pair))
-    print(f"score it with: ./verso score {options.place} {folder} --split test")
+
+
+def keep(net: nn.Module, options: argparse.Namespace) -> None:
+    """Write network.pt, if `--out` names a folder."""
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
+        kept = {"weights": net.state_dict(), "epochs": options.epochs, "seed": options.seed}
+        torch.save(kept, options.out / "network.pt")
+
+
+def main() -> None:
+    """Train, and keep the network and its predictions."""
+    options = read_options(__doc__, EPOCHS)
+    data, net = load(options.place), Net()
+    tell_size(net, data)
+    train(net, data, options.epochs)
+    keep(net, options)
+    if options.out is not None:
+        folder, predict = options.out / "predictions", predictor(net)
+        for pair in pairs_of_split(open_dataset(options.place), "test"):
+            write(folder, pair, predict(pair))
+        print(f"score it with: ./verso score {options.place} {folder} --split test")
 
 
 if __name__ == "__main__":
-    learn(__doc__, EPOCHS, Net)
+    main()

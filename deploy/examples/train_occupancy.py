@@ -1,24 +1,24 @@
-"""Trains a small network to tell where an object is solid from one view of it, and has it predict held-out instances.
+"""Trains a small network to tell where an object is solid from one view of it, and scores it on held-out instances.
 
 PYTHONPATH=. .venv/bin/python deploy/examples/train_occupancy.py data/targets [--epochs N] [--out DIR]
 
 It takes points of the input view and a place, and answers whether the place is inside the object (Mescheder et al. 2019).
-occupancy.py tells its frame and unit. DIR/predictions is what `verso score` reads.
+occupancy.py tells its frame and unit, and what it is compared with.
 """
 
+import json
+from collections import defaultdict
 from itertools import pairwise
 
 import numpy as np
 import torch
-from guesses import Prediction, Predictor, regions_of
 from mirror_depth import Split, pairs_of_split
-from occupancy import FEATURES, Example, Flags, make_example
+from occupancy import FEATURES, Example, Flags, iou, make_example
 from torch import Tensor, nn
 from torch.nn import functional
-from train_mirror_depth import learn, stack
+from train_mirror_depth import keep, read_options, stack, tell_size, train
 
 from services.dataset.dataset import open_dataset
-from services.dataset.pair import Pair
 
 SURE = 0.3
 """Probability from which a place counts as inside: the best of the validation split, since few places of thin shapes are."""
@@ -78,17 +78,31 @@ def answer(net: OccupancyNet, example: Example) -> Flags:
     return inside
 
 
-def predictor(net: OccupancyNet) -> Predictor:
-    """Says what is inside at an object's stored volume points: nothing where its patch leaves the image."""
+def evaluate(net: OccupancyNet, place: str) -> dict[str, dict[str, float]]:
+    """Mean IoU over the test split, of all objects and of each category, of the network and of the baselines."""
+    scores: dict[str, dict[str, list[float]]] = {name: defaultdict(list) for name in ("network", "half turn", "shadow")}
+    for pair in pairs_of_split(open_dataset(place), "test"):
+        if (example := make_example(pair)) is not None:
+            answers = answer(net, example), example.turned, example.shadow
+            for of, inside in zip(scores.values(), answers, strict=True):
+                of["all"].append(iou(inside, example.inside))
+                of[pair.category].append(of["all"][-1])
+    return {name: {group: float(np.nanmean(of[group])) for group in sorted(of)} for name, of in scores.items()}
 
-    def predict_pair(pair: Pair) -> Prediction:
-        examples = {region: make_example(pair, region, uniform=False) for region in regions_of(pair)}
-        none = {region: np.zeros(len(pair.samples(region)["volume_points"]), bool) for region in examples}
-        answers = {region: answer(net, example) for region, example in examples.items() if example}
-        return Prediction(volumes=none | answers)
 
-    return predict_pair
+def main() -> None:
+    """Train, score, print, and keep the network."""
+    options = read_options(__doc__, EPOCHS)
+    data, net = load(options.place), OccupancyNet()
+    tell_size(net, data)
+    train(net, data, options.epochs, loss_of)
+    scores = evaluate(net, options.place)
+    keep(net, options)
+    print(f"{'IoU':12}{''.join(f'{group:>8}' for group in scores['network'])}")
+    for name, means in scores.items():
+        print(f"{name:12}{''.join(f'{value:8.3f}' for value in means.values())}")
+    print(json.dumps(scores))
 
 
 if __name__ == "__main__":
-    learn(__doc__, EPOCHS, OccupancyNet, load, loss_of, predictor)
+    main()

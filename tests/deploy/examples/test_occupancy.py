@@ -1,4 +1,4 @@
-"""What the occupancy example gives a network, without PyTorch."""
+"""What the occupancy example gives a network, its baselines and its score, without PyTorch."""
 
 import numpy as np
 import occupancy
@@ -33,13 +33,11 @@ def test_a_sample_in_the_frame_of_the_network_is_inside_where_the_resting_mesh_i
 
 def test_the_shadow_is_what_a_ray_from_the_camera_meets_behind_the_object_and_a_box_lies_in_it(shapes):
     for pair, one in shapes:
-        above = one.queries[:, 2] > 0
-        shadow, turned = (above & (one.queries[:, column] > 0) for column in (3, 6))
-        hidden = is_behind(pair, in_world(pair, one.queries[:400, :3].astype(float))) & above[:400]
-        assert (hidden == shadow[:400]).mean() > 0.9
-        assert (turned & shadow).any() and (turned < shadow).any()
+        hidden = is_behind(pair, in_world(pair, one.queries[:400, :3].astype(float))) & (one.queries[:400, 2] > 0)
+        assert (hidden == one.shadow[:400]).mean() > 0.9
+        assert (one.turned <= one.shadow).all() and one.turned.any() and (one.turned < one.shadow).any()
         if pair.category == "box":
-            assert shadow[one.inside].mean() > 0.9 and (shadow & one.inside).sum() > 0.5 * (shadow | one.inside).sum()
+            assert one.shadow[one.inside].mean() > 0.9 and occupancy.iou(one.shadow, one.inside) > 0.5
 
 
 def test_half_a_turn_takes_a_cylinder_to_itself():
@@ -48,3 +46,14 @@ def test_half_a_turn_takes_a_cylinder_to_itself():
     turned = occupancy.half_turn(cylinder, cylinder[cylinder[:, 0] < 0.1])
     assert np.abs(np.hypot(turned[:, 0] - 0.1, turned[:, 1] + 0.05) - 0.2).max() < 0.01
     assert np.abs(turned - cylinder)[:, :2].max() > 0.39 and np.array_equal(turned[:, 2], cylinder[:, 2])
+
+
+def test_iou_is_one_for_the_truth_and_falls_when_answers_are_shuffled(shapes):
+    none, every = np.zeros(2000, bool), np.ones(2000, bool)
+    assert np.isnan(occupancy.iou(none, none)) and occupancy.iou(none, every) == 0
+    for _, one in shapes:
+        share = one.inside.mean()
+        assert occupancy.iou(one.inside, one.inside) == 1 and occupancy.iou(every, one.inside) == share
+        shuffled = np.random.default_rng(1).permutation(one.inside)
+        independent = share / (2 - share)
+        assert occupancy.iou(shuffled, one.inside) == pytest.approx(independent, abs=0.04)
