@@ -106,7 +106,7 @@ def test_cameras_project_the_cloud_onto_the_object_and_its_colours(shaped, expor
 
 
 def test_an_object_that_is_stored_with_alpha_has_images_without(tmp_path):
-    far = {"sensor": STUDIO["cameras"]["sensor"], "more": [{"name": "far", "ring": {"count": 2, "radius_m": 8.0}}]}
+    far = {"sensor": STUDIO["cameras"]["sensor"], "more": [{"name": "far", "ring": {"count": 2, "radius_m": 6.0}}]}
     asked = {"shape": ["surface", "volume"], "points": 300}
     store, _ = make_dataset(tmp_path / "out", **{**STUDIO, "scenes": 1, "cameras": far, "targets": asked})
     assert sum(export_to(store, tmp_path / "new", "occnet").manifest["images"].values()) >= 2
