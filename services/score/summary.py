@@ -299,14 +299,10 @@ def compare(a: pa.Table, b: pa.Table, tested: Collection[str]) -> dict[str, dict
             one, other, *shares = (_mean(each[:, place]) or 0.0 for each in (mine, theirs, covered, also_covered))
             p = _wilcoxon((theirs - mine)[:, place], scenes) if name in tested and min(shares) == 1.0 else None
             better = "b" if (other > one) == is_better_high(name) else "a"
-            answer[name] = {
-                "a": one,
-                "b": other,
-                "difference": apart["value"],
-                "low": apart["low"],
-                "high": apart["high"],
-            }
-            answer[name] |= {"items": apart["items"], "coverage": min(shares), "p": p, "better": better}
+            answer[name] = {"a": one, "b": other, "difference": apart["value"]} | {
+                "low": apart["low"], "high": apart["high"], "items": apart["items"],
+                "coverage": min(shares), "p": p, "better": better,
+            }  # fmt: skip
     return answer
 
 

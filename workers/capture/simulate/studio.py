@@ -342,8 +342,19 @@ def build_studio(
     if simulate.distortion is not None:
         drawn, *places = pinhole_lookup(simulate.distortion, rig.color)
         lookup = places[0], places[1]
-    light = appearance, rig, T_world_board, chance, drawn, lookup
-    return Studio(simulate, plan_capture(simulate), tuple(things), *light, walls, surroundings)
+    return Studio(
+        simulate=simulate,
+        effects=plan_capture(simulate),
+        things=tuple(things),
+        appearance=appearance,
+        rig=rig,
+        T_world_board=T_world_board,
+        chance=chance,
+        drawn_color=drawn,
+        lookup=lookup,
+        walls=walls,
+        surroundings=surroundings,
+    )
 
 
 VIEWS_PER_TURN = 14
