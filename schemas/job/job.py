@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, Field, field_validator, model_validator
@@ -255,17 +255,9 @@ class Job(Frozen):
 
     @model_validator(mode="after")
     def _offers_categories(self) -> "Job":
-        sources = [source.model_dump() for source in self.assets.objects]
-        built_in = all(source["source"] == "procedural" for source in sources)  # else known where a library is opened
-        maps = {
-            "categories": (self.categories, ()),
-            "assets.density_kg_m3": (self.assets.density_kg_m3, ()),
-            "physics.friction": (self.physics.friction, (TABLE,)),
-        }
-        for key, (given, more) in maps.items() if built_in else ():
-            names = given if isinstance(given, Mapping) else ()
-            if unknown := describe_unknown(names, (*offered_by(sources), *more), key):
-                raise ValueError(unknown)
+        built_in = all(source.source == "procedural" for source in self.assets.objects)  # else where libraries are opened
+        if built_in and (unknown := self.describe_unknown()):
+            raise ValueError(unknown)
         return self
 
     @model_validator(mode="after")
@@ -285,6 +277,20 @@ class Job(Frozen):
             remedy = "leave out sensor.distortion, sensor.rgb_noise and sensor.exposure"
             raise ValueError(f"render.rgb is false and sensor asks for an effect on RGB: {remedy}")
         return self
+
+    def describe_unknown(self, of_libraries: Iterable[str] = ()) -> str:
+        """The first name in a map by category that neither built-in shapes nor the libraries offer, with its key; or empty."""
+        offered = *offered_by([source.model_dump() for source in self.assets.objects]), *of_libraries
+        maps = {
+            "categories": (self.categories, ()),
+            "assets.density_kg_m3": (self.assets.density_kg_m3, ()),
+            "physics.friction": (self.physics.friction, (TABLE,)),
+        }
+        for key, (given, more) in maps.items():
+            names = given if isinstance(given, Mapping) else ()
+            if unknown := describe_unknown(names, (*offered, *more), key):
+                return unknown
+        return ""
 
     @property
     def has_alpha(self) -> bool:

@@ -172,6 +172,8 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
     """
     look, categories = job.drawn_look, {*job.categories, *((job.look.clutter and job.look.clutter.categories) or ())}
     catalogue = open_catalogue(job.assets, job_folder, tuple(categories), watch)
+    if unknown := job.describe_unknown(name for library in catalogue.libraries() for name in library.entries):
+        raise AssetSourceError(unknown)
     poses, scenes = open_poses(job, job_folder), open_scenes(job, job_folder)
     pictures: Pictures = {}
     further = [file.sha256 for file in (*poses.values(), scenes) if file is not None]

@@ -3,6 +3,7 @@
 import pickle
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import trimesh
 
 from schemas.errors import AssetSourceError, MeshError
 from schemas.job.assets import CATEGORIES, Assets, LibrarySource, ProceduralSource, SplitShares
+from services.job.job_file import validate_job
 from tests.kit.shapes import asset_of
 from tests.workers.door.oracles import CUBE, textured_obj, write, write_all
 from workers.assets import catalogue as catalogue_file
@@ -23,6 +25,7 @@ from workers.assets.catalogue import (
     open_cache,
     open_catalogue,
 )
+from workers.capture.results import open_sources
 
 BUILT_IN = ProceduralSource(source="procedural")
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -88,6 +91,20 @@ def test_what_cannot_be_offered_is_refused_with_what_was_found_and_a_remedy(tmp_
         opened(tmp_path, tables=(folder(),))
     assert opened(tmp_path, folder("net"), BUILT_IN, categories=("mug", "box"))
     assert opened(tmp_path, BUILT_IN, BUILT_IN.model_copy(update={"size": "metric", "seed": 1}))
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [({"assets": {"density_kg_m3": {"vasee": 900.0}}}, "assets.density_kg_m3.vasee: .* did you mean 'vase'"),
+     ({"physics": {"friction": {"table": 0.4, "vasee": 0.6}}}, "physics.friction.vasee: .* did you mean 'vase'"),
+     ({"assets": {"density_kg_m3": {"vase": 900.0}}, "physics": {"friction": {"table": 0.4, "vase": 0.6}}}, "")],
+)  # fmt: skip
+def test_a_map_by_category_has_names_that_the_libraries_offer(tmp_path, keys, message):
+    write(tmp_path / "things/vase/0.obj", CUBE)
+    assets = {"objects": [{"source": "library", "folder": "things"}], **keys.get("assets", {})}
+    job = validate_job({"name": "x", "categories": ["vase"], **keys, "assets": assets}, "x")
+    with pytest.raises(AssetSourceError, match=message) if message else nullcontext():
+        open_sources(job, tmp_path)
 
 
 def test_a_bad_mesh_among_good_ones_is_never_drawn_and_moves_no_other_draw(tmp_path):

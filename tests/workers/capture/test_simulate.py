@@ -328,6 +328,7 @@ def test_a_room_and_a_floor_stand_around_the_board_and_a_camera_outside_of_it_is
     small = job.look.model_copy(update={"room": job.look.room.model_copy(update={"size_m": Range(1.0, 1.1)})})
     with pytest.raises(ViewError, match=r"capture's camera stands .* raise look.room.size_m"):
         simulate_capture(low, Board(), asset_of(), SceneChance(11, 0), tmp_path / "small", around=(small, around[1]))
+    assert not any((tmp_path / "small").iterdir()), "refused before a file is written"
     wide = Board(width_m=1.2)
     with pytest.raises(StartError, match="the board reaches"):
         simulate_capture(low, wide, asset_of(), SceneChance(11, 0), tmp_path / "wide", around=(small, around[1]))

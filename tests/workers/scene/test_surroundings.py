@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from schemas.base import Range
-from schemas.errors import AssetSourceError, JobError, StartError, ViewError
+from schemas.errors import AssetSourceError, JobError, MeshError, StartError, ViewError
 from schemas.job.job import job_digest
 from schemas.job.look import Palette, Room, Surface
 from schemas.scene.shape import REGION_FIRST_CLUTTER, REGION_FIRST_OBJECT, REGION_FLOOR, Part
@@ -223,8 +223,10 @@ def test_pictures_are_turned_upright_reduced_and_part_of_what_decides_a_scene(tm
     pixels[:, :1100] = 255
     turned, at = Image.Exif(), tmp_path / "below"
     turned[0x0112] = 6  # to be turned by a quarter clockwise
-    at.mkdir()
-    Image.fromarray(pixels).save(at / "a.jpg", exif=turned)
+    for folder in (at, tmp_path / ".thumbnails"):
+        folder.mkdir()
+        Image.fromarray(pixels).save(folder / "a.jpg", exif=turned)
+    (at / "._a.jpg").write_bytes(b"of another system, beside a.jpg")  # hidden files are no pictures
     job = validate_job({"name": "x", "look": {"background": str(tmp_path)}}, "x")
     before = open_sources(job, Path())
     ((picture,),) = before.pictures.values()
@@ -239,8 +241,12 @@ def test_pictures_are_turned_upright_reduced_and_part_of_what_decides_a_scene(tm
         != before.digest
         != open_sources(validate_job({"name": "x"}, "x"), Path()).digest
     )
-    with pytest.raises(Exception, match="does not hold what it held"):
-        load_picture(replace(picture, sha256="0" * 64))
+    load_picture.cache_clear()
+    for change, message in ((lambda: None, "does not hold what it held"), ((at / "a.jpg").unlink, "a.jpg")):
+        change()
+        with pytest.raises(MeshError, match=message) as raised:
+            load_picture(picture)
+        assert raised.value.kind == "environmental", "made from the job and its seed with the file of before"
 
 
 @pytest.mark.parametrize(

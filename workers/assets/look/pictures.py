@@ -51,18 +51,18 @@ Pictures = Mapping[str, Sequence[Picture]]
 
 
 def open_pictures(look: Look, job_folder: Path) -> Pictures:
-    """Every picture of the folders that `look` names, each read once. Raises AssetSourceError with the key and the file."""
+    """Every picture of the folders that `look` names but hidden ones, each read once.
+
+    Raises AssetSourceError with the key and the file.
+    """
     opened = {}
     for key, named in look.folders.items():
         folder = (job_folder / Path(named).expanduser()).resolve()
         if not folder.is_dir():
             raise AssetSourceError(f"{key}: {folder}: there is no such folder")
-        files = sorted(
-            (Path(place) / name).relative_to(folder).as_posix()
-            for place, _, names in os.walk(folder)
-            for name in names
-            if name.lower().endswith(SUFFIXES)
-        )
+        paths = (Path(place, name).relative_to(folder) for place, _, names in os.walk(folder) for name in names)
+        shown = (path for path in paths if not any(part.startswith(".") for part in path.parts))
+        files = sorted(path.as_posix() for path in shown if path.name.lower().endswith(SUFFIXES))
         if not 0 < len(files) <= MOST_PICTURES:
             raise AssetSourceError(
                 f"{key}: {folder} has {len(files)} pictures ({', '.join(SUFFIXES)}): give 1 to {MOST_PICTURES}"
@@ -106,7 +106,10 @@ def _decode(data: bytes, path: Path) -> NDArray[np.uint8]:
 def load_picture(picture: Picture) -> NDArray[np.uint8]:
     """[h, w, 3] uint8 sRGB, the same array for the same picture. Raises MeshError where it is not what it was."""
     path = picture.folder / picture.name
-    data = read_bytes(path, MOST_BYTES, MeshError)
+    try:
+        data = read_bytes(path, MOST_BYTES, MeshError)
+    except MeshError as error:
+        raise MeshError("missing", error.detail, "environmental") from error
     if hashlib.sha256(data).hexdigest() != picture.sha256:
-        raise MeshError("changed", f"{path} does not hold what it held when the run began")
+        raise MeshError("changed", f"{path} does not hold what it held when the run began", "environmental")
     return _decode(data, path)

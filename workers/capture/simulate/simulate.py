@@ -240,7 +240,6 @@ def photograph(studio: Studio, number: int, T_board_cam: Pose) -> tuple[Captured
 def take_light(studio: Studio, number: int, T_world_cam: Pose) -> Array:
     """[H, W, 3]: linear light of one exposure; T_world_cam is the pose at its middle, and of its middle row."""
     k, simulate = studio.rig.color, studio.simulate
-    require_camera_inside(studio.walls, "capture's", Camera(k, T_world_cam))
     blur, rolling = (
         AT_REST if time_s is None else draw_motion(time_s, studio.chance.stream(Stream.MOTION, number))
         for time_s in (simulate.motion_blur, simulate.rolling_shutter)
@@ -333,16 +332,16 @@ HELD_OUT_UNITS_PER_M = 10_000.0
 """Finer than a capture's, so that rounding is no part of an error: 0.1 mm, up to 6.5 m."""
 
 
-def write_held_out(studio: Studio, board: Board, target: Array, path: Path) -> None:
-    """Write `VIEWS` exact views to `path`, a new folder of the same layout as a capture.
+def write_held_out(studio: Studio, board: Board, poses: Array, path: Path) -> None:
+    """Write exact views from `poses` [V, 4, 4], board frame, to `path`, a new folder of the same layout as a capture.
 
-    Their poses are drawn as those of a path around `target` [3], board frame, and stand in board_00000.txt. They are pictures
-    of the same things without the effects of any sensor or lens: depth and mask are those of the pixel centres.
+    The poses stand in board_00000.txt. They are pictures of the same things without the effects of any sensor or lens: depth
+    and mask are those of the pixel centres.
     """
     path.mkdir(parents=True)
-    ideal = studio.simulate.model_copy(update={"views": VIEWS} | dict.fromkeys(CAPTURE_EFFECTS))
+    ideal = studio.simulate.model_copy(update=dict.fromkeys(CAPTURE_EFFECTS))
     exact = replace(studio, simulate=ideal, drawn_color=studio.rig.color, lookup=None)
-    for number, T_board_cam in enumerate(plan_path(ideal, target, studio.chance.stream(Stream.HELD_OUT))):
+    for number, T_board_cam in enumerate(poses):
         T_world_cam = studio.T_world_board @ T_board_cam
         depth_m, region = draw_labels(exact, Camera(studio.rig.color, T_world_cam))
         depth = stored_depth(depth_m, HELD_OUT_UNITS_PER_M)
@@ -369,6 +368,10 @@ def simulate_capture(
     studio = build_studio(simulate, board, thing, chance, around)
     target = thing.T_world_shape[:3, 3]
     poses = plan_path(simulate, target, chance.stream(Stream.CAMERA))
+    few = simulate.model_copy(update={"views": VIEWS})
+    held_out = plan_path(few, target, chance.stream(Stream.HELD_OUT))
+    for T_board_cam in (*poses, *held_out):  # before anything is written
+        require_camera_inside(studio.walls, "capture's", Camera(studio.rig.color, studio.T_world_board @ T_board_cam))
     for number, T_board_cam in enumerate(poses):
         view, mask = photograph(studio, number, T_board_cam)
         write_view(path, view)
@@ -381,7 +384,7 @@ def simulate_capture(
         depth_bias_m=0.0 if simulate.depth_noise is None else simulate.depth_noise.bias_m,
         lens=simulate.distortion,
     )
-    write_held_out(studio, board, target, path / TRUTH / HELD_OUT)
+    write_held_out(studio, board, held_out, path / TRUTH / HELD_OUT)
     write_truth(path, truth, asset, studio.effects, studio.surroundings)
     about = CaptureFile(name=f"{asset.category}-{chance.scene_id:05d}", category=asset.category, licence=asset.licence)
     camera = CaptureCamera(studio.rig.color, opencv_lens(simulate.distortion), DEPTH_UNITS_PER_M)
