@@ -255,7 +255,8 @@ class Job(Frozen):
 
     @model_validator(mode="after")
     def _offers_categories(self) -> "Job":
-        built_in = all(source.source == "procedural" for source in self.assets.objects)  # else where libraries are opened
+        # Names of libraries are known where they are opened.
+        built_in = all(source.source == "procedural" for source in self.assets.objects)
         if built_in and (unknown := self.describe_unknown()):
             raise ValueError(unknown)
         return self

@@ -1,7 +1,6 @@
 """Surroundings of a scene: colours by hue, pictures by metres, walls and clutter; what they change, and what they must not."""
 
 import colorsys
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
