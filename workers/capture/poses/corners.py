@@ -88,8 +88,8 @@ class CornerTerm:
     def values(self, poses: Array, shared: Shared) -> Array:
         """[K, 2, 1 + 6 + S] pixels: from where each corner was seen to where it should be, and the derivatives of that."""
         R, t = poses[self.view, :3, :3], poses[self.view, :3, 3]
-        outwards = self.outwards
-        p = np.einsum("kji,kj->ki", R, shared.print_scale * self.board + shared.growth_m * outwards - t)
+        board, outwards, place = (np.einsum("kji,kj->ki", R, part) for part in (self.board, self.outwards, t))
+        p = shared.print_scale * board + shared.growth_m * outwards - place
         z = np.maximum(p[:, 2], 1e-3)
         at = p[:, :2] / z[:, None]
         by_point = np.concatenate([np.broadcast_to(np.eye(2), (len(p), 2, 2)), -at[..., None]], axis=2)
@@ -98,20 +98,28 @@ class CornerTerm:
         residual, by_pose, by_shared = values[..., 0], values[..., 1 : 1 + POSE], values[..., 1 + POSE :]
         residual[:] = self.focal * (at - self.rays) + shared.growth_px * self.grown
         by_pose[:] = np.concatenate([-by_point, by_point @ cross_matrix(p)], axis=2)  # p changes by -dt - dr x p
-        by_shared[:, :, PRINT_SCALE] = np.einsum("kij,klj,kl->ki", by_point, R, self.board)
-        by_shared[:, :, GROWTH_M] = np.einsum("kij,klj,kl->ki", by_point, R, outwards)
+        by_shared[:, :, PRINT_SCALE] = np.einsum("kij,kj->ki", by_point, board)
+        by_shared[:, :, GROWTH_M] = np.einsum("kij,kj->ki", by_point, outwards)
         by_shared[:, :, GROWTH_PX] = self.grown
         return values
 
     def white_rows(self, values: Array, shared: int = SHARED) -> Rows:
         """Rows of values [K, 2, 1 + N + S]: residual, N derivatives by what a view has, S by what is shared."""
         white = values / self.sigma_px[3]
-        place, growth, shape = (part / sigma for part, sigma in zip(self.modes(values), self.sigma_px, strict=False))
-        white[self.square] = (place + growth + shape).reshape(-1, *values.shape[1:])
+        quads = values[self.square].reshape(-1, 8, values.shape[2])
+        white[self.square] = (self.whitening @ quads).reshape(-1, *values.shape[1:])
         weight, cost = robust((white[..., 0] ** 2).sum(axis=1))
         flat, last = white.reshape(-1, white.shape[2]), white.shape[2] - shared
         view = np.repeat(self.view, 2)[:, None]
         return Rows(flat[:, 0], view, flat[:, None, 1:last], flat[:, last:], np.repeat(weight, 2), cost)
+
+    @cached_property
+    def whitening(self) -> Array:
+        """[M, 8, 8]: of the eight coordinates of each marker, the parts of each mode over its sigma."""
+        unit = np.zeros((len(self.board), 2, 8))
+        unit[self.square] = np.tile(np.eye(8).reshape(4, 2, 8), (int(self.square.sum()) // 4, 1, 1))
+        parts = zip(self.modes(unit), self.sigma_px, strict=False)
+        return np.asarray(add_up(part / sigma for part, sigma in parts)).reshape(-1, 8, 8)
 
     def modes(self, values: Array) -> tuple[Array, Array, Array]:
         """(place, growth, shape), each [M, 4, 2, D]: orthogonal parts of values [K, 2, D] of the corners of M markers."""
@@ -232,21 +240,24 @@ def fit_fields(
     prior = np.concatenate([[GROW_M, GROW_PX], fields.sigma[:A]]) ** -2.0
     own_prior = np.concatenate([np.full(POSE, hold), fields.sigma[A:] ** -2.0])
     best: Fitted | None = None
+    P, rows_of = POSE + N, [np.repeat(term.view == number, 2) for number in range(views)]
     for _ in range(steps):
         values = term.values(poses, shared)
         values[..., 0] += fields.alike @ alike + np.einsum("kcn,kn->kc", fields.of_view, own[term.view])
         order = (values[..., : 1 + POSE], fields.of_view, values[..., 1 + POSE :], fields.alike)
         rows = term.white_rows(np.concatenate(order, axis=2), SHARED + A)
         matrix, gradient = np.diag(prior), prior * np.concatenate([[shared.growth_m, shared.growth_px], alike])
+        columns = np.column_stack([rows.by_view[:, 0], rows.by_shared[:, GROWTH_M:], rows.residual])
+        columns *= np.sqrt(rows.weight)[:, None]
         parts = []
-        for number in range(views):
-            J, residual, by = rows.of_view(number)
-            by = by[:, GROWTH_M:]
-            inverse = np.linalg.inv(J.T @ J + np.diag(own_prior + REGULAR))
-            g = J.T @ residual + own_prior * np.concatenate([np.zeros(POSE), own[number]])
-            cross = by.T @ J
-            matrix = matrix + by.T @ by - cross @ inverse @ cross.T
-            gradient = gradient + by.T @ residual - cross @ inverse @ g
+        for number, chosen in enumerate(rows_of):
+            J = columns[chosen]
+            product = J.T @ J
+            of_own, cross, by = product[:P], product[P:-1, :P], product[P:-1]
+            inverse = np.linalg.inv(of_own[:, :P] + np.diag(own_prior + REGULAR))
+            g = of_own[:, -1] + own_prior * np.concatenate([np.zeros(POSE), own[number]])
+            matrix = matrix + by[:, P:-1] - cross @ inverse @ cross.T
+            gradient = gradient + by[:, -1] - cross @ inverse @ g
             parts.append((inverse, g, cross))
         covariance = np.linalg.pinv(matrix, hermitian=True)
         of_poses: Array = np.stack(
