@@ -258,7 +258,7 @@ CHAOTIC = (
             ("two", 2, 0.5, 0.0, "slow"),
             ("two", 2, 1.0, 0.5, "minute"),
             ("two", 2, 4.0, 0.8, "minute"),
-            ("two", 2, 10.0, 0.5, "minute"),
+            ("two", 2, 10.0, 0.5, "slow"),
             ("three", 3, 4.0, 0.8, "minute"),
         )
     ),

@@ -28,6 +28,7 @@ from services.score.predictions import find_predictions
 from services.score.run import _table
 from services.score.summary import summarise
 from tests.datasets import make_dataset
+from tests.kit.tiers import first_of
 from tests.mutations import mutated_bytes, places
 from tests.workers.door.mutants import CHANGES, VALUES, bomb, number, repeat, word
 from tests.workers.door.oracles import glb
@@ -156,7 +157,7 @@ def root(tmp_path_factory):
 
 
 @pytest.mark.parametrize("count", [30, pytest.param(1000, marks=(pytest.mark.slow, pytest.mark.timeout(3000)))])
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", first_of(FORMATS, 4))
 def test_mutants_are_scored_or_refused_in_a_line_and_nothing_else(root, kind, count, tmp_path, capfd):
     ends, seconds = {"ok": 0, "refused": 0, "missing": 0}, []
     items = write_mutants(root, kind, count, tmp_path)

@@ -18,6 +18,7 @@ from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_TABLE, Material, Part, Shape
 from services.cli.main import main
 from tests.conftest import SHARED_DATA
+from tests.kit.tiers import first_of
 from tests.workers.capture.drawn import errors
 from tests.workers.capture.simulated import studio_of
 from workers.capture.board_kinds import KINDS, BoardSizes
@@ -71,9 +72,7 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if n < 2 else pytest.mark.minute) for n, name in enumerate(OTHERS)]
-)
+@pytest.mark.parametrize("name", first_of(OTHERS, 1, 4))
 def test_a_board_that_is_not_board_jsons_is_named_and_the_command_that_is_printed_makes_the_capture_right(
     name, tmp_path
 ):
@@ -111,9 +110,7 @@ SECONDS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if n == 1 else pytest.mark.minute) for n, name in enumerate(SECONDS)]
-)
+@pytest.mark.parametrize("name", first_of(SECONDS, 1, 4))
 def test_of_two_prints_in_view_the_one_that_the_object_stands_on_is_the_board(name, tmp_path):
     poses = photographed(tmp_path, Board(), views=6, beside=SECONDS[name])
     made = process_folder(tmp_path, Captures(estimation=Estimation(compare=True)))
@@ -154,9 +151,7 @@ HANDS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if n < 2 else pytest.mark.minute) for n, name in enumerate(HANDS)]
-)
+@pytest.mark.parametrize("name", first_of(HANDS, 1, 3))
 def test_a_hand_over_the_board_is_no_object_that_moved_and_in_no_cloud_or_mask(name, tmp_path):
     def beside(n):
         return [arm(*one) for one in HANDS[name].get(n, ())]

@@ -138,7 +138,10 @@ class CornerTerm:
         what a view has of its own leaves (restricted maximum likelihood; the median resists what hides markers).
         """
         sigma_px, by_view = self.sigma_px.copy(), rows.by_view[:, 0] * np.sqrt(rows.weight)[:, None]
-        taken = np.einsum("nj,njk->nk", by_view, pose_halves(rows, int(self.view.max()) + 1)[rows.view[:, 0]])
+        taken = np.empty_like(by_view)
+        for number, half in enumerate(pose_halves(rows, int(self.view.max()) + 1)):
+            chosen = rows.view[:, 0] == number
+            taken[chosen] = by_view[chosen] @ half
         values = np.concatenate([rows.residual[:, None], taken], axis=1).reshape(len(self.board), 2, -1)
         parts = [*self.modes(values), values[~self.square][:, None]]
         for mode, (part, degrees) in enumerate(zip(parts, (*MODES, 2), strict=True)):
