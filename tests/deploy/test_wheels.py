@@ -136,6 +136,7 @@ def site(built, tmp_path_factory):
     return folder
 
 
+@pytest.mark.minute
 def test_every_command_of_reading_works_from_the_wheel_and_the_others_say_what_to_install(
     site, dataset, predictions, tmp_path
 ):

@@ -63,6 +63,7 @@ def test_where_no_scene_can_be_made_the_reason_is_told(ours, tmp_path, monkeypat
         bench.run(bench.next_span(2))
 
 
+@pytest.mark.minute
 def test_a_plain_process_makes_every_range_of_its_span_on_its_core(tmp_path):
     before = os.sched_getaffinity(0)
     parts = [Part(JOB, tmp_path, tmp_path / str(n), Span(start=0, stop=3), min(before)) for n in range(2)]

@@ -97,6 +97,7 @@ def test_a_job_whose_scenes_cannot_be_framed_is_refused_before_anything_is_writt
     assert not out.exists()
 
 
+@pytest.mark.minute
 def test_a_run_is_refused_by_its_first_worker_and_leaves_its_folder_as_it_was(tmp_path, capsys):
     job, out = tmp_path / "job.yaml", tmp_path / "out"
     job.write_text(json.dumps({"name": "t", "scenes": 3, "cameras": {"orbit": {"radius_m": 125}}}))

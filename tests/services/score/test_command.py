@@ -461,6 +461,7 @@ def test_an_object_of_one_colour_has_no_score_that_the_table_gives_it(files, tru
     )
 
 
+@pytest.mark.minute
 def test_a_split_is_scored_alone_and_is_proposed_where_nothing_else_is_predicted(files, depths, tmp_path, capsys):
     rows = pq.read_table(score_file(files, depths, tmp_path / "all", capsys)).to_pylist()
     split = max({row["split"] for row in rows} - {"mixed"}, key=[row["split"] for row in rows].count)
@@ -479,6 +480,7 @@ def test_a_split_is_scored_alone_and_is_proposed_where_nothing_else_is_predicted
     assert f"--split {split} and all" in capsys.readouterr().err
 
 
+@pytest.mark.minute
 def test_poses_are_read_by_the_ids_of_the_export_that_they_answer_or_by_ours(files, tmp_path, capsys):
     assert main(["export", str(files.root), str(tmp_path / "bop"), "--format", "bop"]) == 0
     lines = ["scene_id,im_id,obj_id,score,R,t,time"]

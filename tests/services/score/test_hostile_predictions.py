@@ -252,7 +252,10 @@ def hungry(mesh):
     ("limit", "most", "spoil", "told"),
     [
         ("MOST_MIB", 1024, hungry, "more (memory than there is|than 1024 MiB of memory): make it smaller"),
-        ("MOST_CPU_S", 1.5, slow, "takes more than 1.5 s of processor time: make it smaller"),
+        pytest.param(
+            *("MOST_CPU_S", 1.5, slow, "takes more than 1.5 s of processor time: make it smaller"),
+            marks=pytest.mark.minute,
+        ),
     ],
 )
 def test_an_item_beyond_a_limit_is_refused_and_all_others_are_scored(

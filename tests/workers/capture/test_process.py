@@ -187,6 +187,7 @@ EDGES = {
 }
 
 
+@pytest.mark.minute
 @pytest.mark.shared_data
 @pytest.mark.parametrize("name", ["sharpen", *(pytest.param(n, marks=pytest.mark.slow) for n in [*EDGES][1:])])
 def test_what_a_camera_does_to_edges_moves_no_pose_of_an_independent_capture(name, tmp_path, record_figure):
@@ -227,6 +228,7 @@ DEPTH = {
 }
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("seed", SEEDS)
 def test_depth_that_no_sensor_measures_is_named_with_the_key_to_change(seed, tmp_path):
     kept = made(seed, views=VIEWS, image_scale=0.35, depth_noise=KinectDepthNoise()).folder.path

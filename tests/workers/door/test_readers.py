@@ -24,6 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 from schemas.capture import DepthCamera
 from schemas.errors import CaptureError
 from schemas.job.captures import Board
+from tests.kit.tiers import first_of
 from tests.workers.door.oracles import write
 from tests.workers.door.recordings import recording
 from workers.capture.folder import CaptureFile, open_folder, read_view
@@ -683,7 +684,7 @@ def bomb(path, kind):
         return write_bag(path, compression="zstd", kind="mcap")
 
 
-@pytest.mark.parametrize("kind", ["bag", "mcap"])
+@pytest.mark.parametrize("kind", first_of(["mcap", "bag"], 1))
 def test_a_chunk_that_unpacks_without_end_is_refused_before_it_fills_the_memory(kind, tmp_path):
     path = bomb(tmp_path, kind)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -9,6 +9,7 @@ from schemas.base import frozen_array
 from schemas.job.look import BUILT_IN
 from schemas.scene.scene import Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_TABLE, Appearance, Light, MapSource, Part, Shape
+from tests.kit.tiers import first_of
 from tests.workers.render.random_scenes import BLACK, EYE, FLAT, RASTER, camera, matte, paths, small, traced, without
 from workers.assets.look import environment
 from workers.assets.look.environment import expose_map, load_map, relight
@@ -80,7 +81,7 @@ def normals_of(drawn, view):
     return np.stack([v, u], axis=1), world / np.linalg.norm(world, axis=1)[:, None]
 
 
-@pytest.mark.parametrize("name", [*BUILT_IN, "sun"])
+@pytest.mark.parametrize("name", first_of(["sun", *BUILT_IN], 3))
 def test_a_sphere_in_tier_raster_has_the_irradiance_of_the_map(renderer, lit, name, record_figure):
     """Within 5 % everywhere but for 8 bits: its harmonics and lights against the sum over the pixels of the map."""
     look, worst = lit(name), 0.0

@@ -69,7 +69,9 @@ def write_poses(folder: Path) -> str:
 
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("scenes", SCENES)
-@pytest.mark.parametrize(("scene", "kinds"), [("tabletop", ABOVE), ("studio", AROUND)])
+@pytest.mark.parametrize(
+    ("scene", "kinds"), [("tabletop", ABOVE), pytest.param("studio", AROUND, marks=pytest.mark.minute)]
+)
 def test_every_view_of_every_kind_shows_what_rays_meet_and_verifies(tmp_path, scene, kinds, scenes):
     """No failures: the check of every scene by cast rays, which a wrong label fails, is one of those that make it a failure."""
     poses = write_poses(tmp_path)
