@@ -69,6 +69,7 @@ SMALLER = {
     r"/shared/": "shared/",
     r"s3://bucket/": "bucket/",
     r"(train_\w+.py data/\w+)": r"\1 --epochs 1",
+    r"predictions/a predictions/b": "predictions",  # which the page has scored before
 }
 """The same command with less to do, or in places that are here."""
 
@@ -197,7 +198,8 @@ def checkout_at(root: Path) -> Path:
     (root / "recording.mkv").write_bytes(recording())
     predictions = root / "predictions" / "depth"
     predictions.mkdir(parents=True)
-    cv2.imwrite(str(predictions / "00001.png"), np.full((480, 640), 5 * 1300, np.uint16))
+    for pose_id in range(1, 128, 2):  # of 64 scenes, all: below full coverage `score` ends with 1
+        cv2.imwrite(str(predictions / f"{pose_id:05d}.png"), np.full((480, 640), 5 * 1300, np.uint16))
     for number, name in enumerate(("table", "floor")):
         (root / "photos" / name).mkdir(parents=True)
         cv2.imwrite(str(root / "photos" / name / "a.jpg"), np.full((90, 120, 3), 90 + 60 * number, np.uint8))
