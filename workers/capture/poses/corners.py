@@ -118,8 +118,8 @@ class CornerTerm:
         """[M, 8, 8]: of the eight coordinates of each marker, the parts of each mode over its sigma."""
         unit = np.zeros((len(self.board), 2, 8))
         unit[self.square] = np.tile(np.eye(8).reshape(4, 2, 8), (int(self.square.sum()) // 4, 1, 1))
-        parts = zip(self.modes(unit), self.sigma_px, strict=False)
-        return np.asarray(add_up(part / sigma for part, sigma in parts)).reshape(-1, 8, 8)
+        place, growth, shape = (part / sigma for part, sigma in zip(self.modes(unit), self.sigma_px, strict=False))
+        return (place + growth + shape).reshape(-1, 8, 8)
 
     def modes(self, values: Array) -> tuple[Array, Array, Array]:
         """(place, growth, shape), each [M, 4, 2, D]: orthogonal parts of values [K, 2, D] of the corners of M markers."""
