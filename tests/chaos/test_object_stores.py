@@ -35,7 +35,10 @@ def decisions(bucket: Bucket) -> dict[str, int]:
     return {key: times for key, times in bucket.puts.items() if key.startswith("manifest/_commits/")}
 
 
-@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 22))])
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(1, marks=pytest.mark.minute), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 22))],
+)
 def test_a_store_that_fails_one_request_in_ten_gets_the_dataset_of_a_disk(seed, tmp_path, record_figure):
     expected = on_disk(tmp_path)
     bucket = Bucket()

@@ -23,6 +23,7 @@ from services.run.lock import hold_lock
 from services.run.range_planner import plan_ranges
 from tests.kit.faults import REQUESTS, STILL, disk, requests, taken_over
 from tests.kit.made_up_runs import FIRST, LABEL, RANGE, STOP, broken_promises, coordinator_of, make_dataset, settings_of
+from tests.kit.tiers import first_of
 from tests.made_up_scenes import attempt_at, small_scene, terms
 from workers.store.attempt import Attempt, attempts_at, begin_attempt, sweep
 from workers.store.commit import read_record
@@ -90,7 +91,7 @@ def steps_of(place: Place, actor: Callable[[Store, str], None], root: Path) -> i
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("stop", [STOP, STOP + 1], ids=["goes on", "extends"])
 @pytest.mark.parametrize("actor", [coordinate, work], ids=["coordinator", "worker"])
-@pytest.mark.parametrize("kind", PLACES)
+@pytest.mark.parametrize("kind", first_of(PLACES, 1))
 def test_stopped_at_a_step_until_another_has_ended_it_replaces_nothing(
     kind, actor, stop, tmp_path, request, record_figure
 ):

@@ -10,8 +10,13 @@ from workers.scene.effects import EFFECTS, plan_effects
 
 TRACED_EFFECTS = ("global_illumination", "glass")
 
+OF_SECONDS = ("decomposition", "glass", "raycast_check")
+"""Effects whose scene takes two seconds, of which tier, label and fall others stand for by default."""
 
-@pytest.mark.parametrize("name", [effect.name for effect in EFFECTS])
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(e.name, marks=[pytest.mark.minute] * (e.name in OF_SECONDS)) for e in EFFECTS]
+)
 def test_an_effect_that_is_taken_out_of_the_plan_is_taken_out_of_the_run(name):
     if name in TRACED_EFFECTS and not importlib.util.find_spec("mitsuba"):
         pytest.skip("mitsuba is not installed: `./verso extra pathtraced`")

@@ -296,6 +296,7 @@ HOLLOWS = (
         "three tapered cups in one another",
         both(lifted(fitting_m(), 0.2), tilts(0, 0, 0, bound_deg=1.0)),
         lambda: cups(3),
+        tier="minute",
         again="slow",
     ),
     # Let go on 821 faces, which may use up what letting go may cost; then it is refused by name. Twenty nudged seeds settle.

@@ -36,7 +36,9 @@ def hung_by_its_handle() -> Measure:
 EDGES = (
     Case("cube over the edge by 50 %", EITHER, tilt(0.1), lambda: over_edge(0.50)),
     falls("cube over the edge by 51 %", lambda: over_edge(0.51)),
-    settles("mug hung by its handle on a peg at the edge", hung_by_its_handle(), mug_on_peg, again="minute"),
+    settles(
+        "mug hung by its handle on a peg at the edge", hung_by_its_handle(), mug_on_peg, tier="minute", again="slow"
+    ),
     falls("mug with nothing but its handle over the edge", mug_handle_over_edge),
     settles("cube over the edge of a sheet by 40 %", tilt(0.1), lambda: drop(cube(), sheet(), xy=(EDGE_M - 0.01, 0.0))),
 )

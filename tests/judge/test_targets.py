@@ -217,6 +217,7 @@ UNSEEN: tuple[Callable, ...] = (
 )
 
 
+@pytest.mark.minute
 def test_a_covisible_mask_by_one_thing_alone_or_of_a_camera_aside_is_found_and_so_is_a_wrong_pixel(monkeypatch):
     context = context_of(job_of(overlaid(NEAR, {"targets": {"views": ["covisible"]}})))
     laid = lay_scene(context, 1, Stopwatch())

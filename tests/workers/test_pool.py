@@ -90,7 +90,7 @@ def test_a_child_answers_as_many_items_as_its_batch():
         ("endless", "cpu", "more than 1 s of processor time"),
         ("memory", "memory", "more than 2048 MiB of memory"),
         ("file", "memory", "more than 2048 MiB"),
-        ("asleep", "wall", "more than 4 s"),
+        pytest.param("asleep", "wall", "more than 4 s", marks=pytest.mark.minute),
         ("crash", "crashed", "SIGSEGV"),
         ("exit", "crashed", "exit code 3"),
         ("killed", "killed", "killed from outside"),
@@ -153,6 +153,7 @@ def test_items_are_asked_for_when_a_child_is_free_and_may_follow_from_answers():
         assert list(pool.run([7])) == [(7, b"14")]  # and the same children serve the next run
 
 
+@pytest.mark.minute
 def test_nothing_begins_after_the_deadline_and_what_is_late_is_ended():
     begun = time.monotonic()
     items = iter(["fine", "asleep", "fine 2"])

@@ -57,6 +57,7 @@ def small(tmp_path_factory):
     return open_dataset(make_dataset(tmp_path_factory.mktemp("small"), targets=targets, **HALVES)[0].root)
 
 
+@pytest.mark.minute
 def test_level_3_has_the_pixels_that_the_same_job_with_noise_stores(small, tmp_path):
     noise = {"depth_noise": {}, "rgb_noise": {}}
     noisy = open_dataset(make_dataset(tmp_path, sensor=noise, check={"mirror_agreement_mm": 50.0}, **HALVES)[0].root)

@@ -61,6 +61,7 @@ def things_of(pair) -> list[Placed]:
     return [Placed(number, shape_of(mesh), np.eye(4)) for number, mesh in meshes.items()]
 
 
+@pytest.mark.minute
 def test_a_cloud_lies_on_the_mesh_in_every_frame(pairs):
     for pair, view in views_of(pairs):
         for number in objects_of(view):

@@ -32,6 +32,7 @@ def folder(files, shaped, studio, tmp_path_factory):
     return place
 
 
+@pytest.mark.minute
 def test_every_command_of_the_page_exports(folder):
     assert len(COMMANDS) == 15 and "`--shard-mb` (256)" in PAGE
     assert {words[words.index("--format") + 1] for words in COMMANDS} == set(FORMATS)

@@ -64,6 +64,7 @@ def models_of(folder):
     return {model.name: (split, model) for split in SPLITS for model in load_models(folder, split)}
 
 
+@pytest.mark.minute
 def test_every_object_is_in_the_list_of_its_split_with_occupancies_of_its_solid(shaped, exported):
     folder, manifest = exported["occnet"]
     models, objects = models_of(folder), objects_of(shaped)

@@ -27,6 +27,7 @@ from services.export.table import FORMATS
 from services.job.record import require_job
 from services.read.scene_geometry import Sources
 from tests.datasets import in_a_bucket, make_dataset
+from tests.kit.tiers import first_of
 from tests.services.export.exported import contents, export_to, source_rows
 from workers.store.commit import list_codes, read_record
 from workers.store.local import LocalStore
@@ -104,7 +105,7 @@ def test_a_writer_that_describes_what_every_manifest_has_is_refused(key, files, 
     assert not (tmp_path / "out/export.json").exists()
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", first_of(FORMATS, 3))
 def test_files_tars_and_a_bucket_are_exported_to_the_same_bytes(name, request, tmp_path):
     files, tars = map(request.getfixturevalue, OF.get(name, ("files", "tars")))
     sources = {"files": files, "tars": tars, "bucket": in_a_bucket(tars.root)}

@@ -77,6 +77,7 @@ def test_what_is_wrong_is_told_with_its_remedy(shown, tmp_path, monkeypatch, cap
         read_three.__wrapped__()
 
 
+@pytest.mark.minute
 def test_a_bucket_with_tars_gives_the_same_report(tmp_path):
     local, _ = make_dataset(tmp_path, name="other", scenes=2, categories=["can"], output={"layout": "tar"})
 

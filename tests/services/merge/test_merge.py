@@ -150,6 +150,7 @@ def test_a_commit_that_arrives_during_the_merge_is_noticed(far, tmp_path, monkey
     assert read_success(store) is None
 
 
+@pytest.mark.minute
 def test_an_object_store_is_asked_for_each_file_of_a_range_once_and_many_at_a_time():
     asked = {}
     for ranges in (4, 16):
@@ -188,6 +189,7 @@ def test_a_dataset_whose_killed_scenes_were_retried_has_the_digest_of_one_withou
     assert merge(store, FIRST, STOP) == merged[1]
 
 
+@pytest.mark.minute
 def test_the_digest_tells_of_a_changed_image_row_shape_or_failure(merged, tmp_path):
     def with_row(output, table: str, **changes):
         return dataclasses.replace(output, rows={**output.rows, table: [{**output.rows[table][0], **changes}]})

@@ -174,6 +174,7 @@ def at_each_step(tmp_path, happens) -> None:
         check_ends(world)
 
 
+@pytest.mark.minute
 def test_a_supervisor_killed_at_any_step_loses_nothing_and_starts_nothing_twice(tmp_path):
     def die(world, supervisors) -> None:
         raise Killed
@@ -263,6 +264,7 @@ def test_a_second_supervisor_is_refused_by_name(tmp_path):
         pass
 
 
+@pytest.mark.minute
 def test_five_jobs_come_to_their_ends_in_a_bucket_that_fails_one_request_in_ten(tmp_path):
     bucket = Bucket()
     bucket.share, bucket.faults = 0.1, ("500", "503", "503 when done", "reset", "reset when done")

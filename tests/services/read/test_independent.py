@@ -28,6 +28,7 @@ from services.read.audit import describe_independent, verify_independently
 from services.read.independent.poses import check_forces
 from tests.captures import CAMERA, captures_job, exact_capture, use_exact_captures
 from tests.datasets import faults_of, make_dataset, overlaid, run_here
+from tests.kit.tiers import first_of
 from workers.capture import make_capture, rows
 from workers.geometry.camera import look_at
 from workers.geometry.frames import pose, rotation_about, translation
@@ -87,7 +88,7 @@ HEALTHY = {
 }
 
 
-@pytest.mark.parametrize("name", HEALTHY)
+@pytest.mark.parametrize("name", first_of(HEALTHY, 5))
 def test_a_healthy_dataset_has_no_faults(tmp_path, name):
     store, _ = make_dataset(tmp_path, **HEALTHY[name])
     found = verify_independently(store, 9, lambda _: None)
@@ -225,7 +226,7 @@ WRONG = {
     "transposed poses": (tables.cam_pose_lines, transposed, "camPoses.csv: T01, T02, T03, "),
 }
 """(the right formula, the wrong one made of it, what is told); one for each thing that is derived."""
-MORE = {"yaw", "half a pixel in projection", "coordinates", "cx_opencv"}
+MORE = {"yaw", "half a pixel in projection", "offset", "orbit", "coordinates", "cx_opencv"}
 """Those whose kind (a camera, an image, a label) another one stands for by default."""
 
 
@@ -409,7 +410,7 @@ WRONG_NAMED: dict[str, tuple[object, str, Callable[[Any], object], dict[str, Any
 """(where it is, its name, the wrong one made of it, the job, what is told) for each thing that is derived of named cameras."""
 
 
-@pytest.mark.parametrize("name", WRONG_NAMED)
+@pytest.mark.parametrize("name", first_of(WRONG_NAMED, 6))
 def test_a_named_camera_that_stands_or_shows_another_thing_is_found(tmp_path, monkeypatch, plant, name):
     owner, attribute, wrong, job, told = WRONG_NAMED[name]
     monkeypatch.setattr(owner, attribute, wrong(getattr(owner, attribute)))

@@ -264,6 +264,7 @@ def first_stall(take_stalls, within_s: float) -> tuple[AttemptName | None, Sight
     raise TimeoutError
 
 
+@pytest.mark.minute
 def test_a_worker_that_stays_in_a_scene_is_found_and_one_that_goes_on_is_not(store):
     stuck = begin_attempt(store, Span(start=4, stop=8), TERMS, "label")
     lively = begin_attempt(store, Span(start=8, stop=12), TERMS, "label")
@@ -281,6 +282,7 @@ def test_a_worker_that_stays_in_a_scene_is_found_and_one_that_goes_on_is_not(sto
     assert sight.idle_s > SCENE_FACTOR * 2 * LIMIT_S
 
 
+@pytest.mark.minute
 def test_a_run_in_which_nothing_begins_is_found_and_a_worker_between_scenes_has_longer(store):
     with watch(store, "label", LIMIT_S) as take_stalls:
         attempt, _, _ = first_stall(take_stalls, 20)

@@ -43,6 +43,7 @@ def sleeper():
     child.wait()
 
 
+@pytest.mark.minute
 def test_orphans_in_other_sessions_stopped_and_stubborn_ones_are_ended_and_nobody_else(sleeper):
     begun = time.monotonic()
     done = subprocess.run([sys.executable, "-c", FAMILY], cwd=ROOT, capture_output=True, text=True, check=True)
@@ -201,6 +202,7 @@ def test_a_signal_ends_the_command_and_all_that_it_started(number):
     assert not any(Path(f"/proc/{process.pid}").exists() for process in below)
 
 
+@pytest.mark.minute
 def test_what_a_run_starts_below_another_run_has_the_marks_of_both(monkeypatch):
     """The outer one is killed with all of the inner one's supervisors: its last process ends what that started, too."""
     outer = uuid.uuid4().hex

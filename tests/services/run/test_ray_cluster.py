@@ -80,6 +80,7 @@ def test_a_cluster_whose_token_is_missing_is_told_in_one_line(tmp_path):
     assert last.endswith("needs RAY_AUTH_MODE=token and its RAY_AUTH_TOKEN here too")
 
 
+@pytest.mark.minute
 @pytest.mark.ray
 def test_a_private_ray_is_reached_by_nobody_else_and_leaves_nothing(tmp_path, monkeypatch):
     """For a user with settings of an own cluster, and a temporary folder with a name that is too long for sockets."""

@@ -93,6 +93,7 @@ def test_the_finished_folder_holds_what_was_promised(made):
     assert not list((out / "_staging").glob("*/*"))
 
 
+@pytest.mark.minute
 def test_what_does_not_belong_to_the_job_is_refused_and_left_as_it_is(made, tmp_path):
     copy, photos = tmp_path / "copy", tmp_path / "theirs" / "photos"
     shutil.copytree(made[0], copy)

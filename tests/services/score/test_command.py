@@ -97,6 +97,7 @@ def test_truth_is_perfect_and_its_page_needs_no_network(files, truth, tmp_path, 
     assert len(rows) == 3 * PAIRS and {row["status"] for row in rows} == {"ok"}
 
 
+@pytest.mark.minute
 def test_hidden_pixels_are_those_of_the_stored_mask_where_there_is_one(tmp_path, capsys):
     """Depth is 10 mm off where the mask says that the input camera does not see: by the input image's pixels, some of both."""
     store, _ = make_dataset(tmp_path / "new", targets={"views": ["covisible"]})
@@ -214,6 +215,7 @@ def test_each_fault_is_an_item_with_its_reason_and_counts_as_worst(files, truth,
     assert answer["metrics"]["pose_rotation_deg"]["value"] == 180.0
 
 
+@pytest.mark.minute
 def test_an_item_that_ends_its_process_is_refused_and_the_others_are_scored(
     files, depths, tmp_path, capsys, monkeypatch
 ):
@@ -233,6 +235,7 @@ def test_an_item_that_ends_its_process_is_refused_and_the_others_are_scored(
     assert "start again, what is scored is kept" in capsys.readouterr().err
 
 
+@pytest.mark.minute
 def test_two_runs_into_one_folder_and_a_dataset_that_grows_meanwhile_are_told(
     files, depths, tmp_path, capsys, monkeypatch
 ):
@@ -257,6 +260,7 @@ def test_two_runs_into_one_folder_and_a_dataset_that_grows_meanwhile_are_told(
     assert not (tmp_path / "score" / "items.parquet").exists() and main(words) == 0
 
 
+@pytest.mark.minute
 def test_the_better_of_two_is_told_and_what_was_scored_is_kept(files, truth, tmp_path, capsys):
     near = write_depth(files, tmp_path / "near", lambda depth_m, _: depth_m + 0.001 * (depth_m > 0))
     far = write_depth(files, tmp_path / "far", lambda depth_m, n: depth_m + (0.004 + 0.0001 * n) * (depth_m > 0))
@@ -294,6 +298,7 @@ def require_groups_that_add_up(summary):
             assert not parts or total / whole["items"] == pytest.approx(whole[key])
 
 
+@pytest.mark.minute
 def test_the_numbers_of_the_page_follow_from_the_items_by_the_queries_under_them(
     files, truth, tmp_path, capsys, monkeypatch
 ):
@@ -334,6 +339,7 @@ def test_the_numbers_of_the_page_follow_from_the_items_by_the_queries_under_them
     assert whole["depth_mae_m"]["coverage"] == pytest.approx(covered) and 0.6 < covered < 0.75
 
 
+@pytest.mark.minute
 def test_who_does_not_predict_comes_last_and_no_verdict_is_given(files, truth, tmp_path, capsys):
     """One right pixel an image, one item, and none that can be read, beside a full guess that is 30 mm off."""
 
@@ -368,6 +374,7 @@ def test_who_does_not_predict_comes_last_and_no_verdict_is_given(files, truth, t
     assert worst["depth_mae_m"]["value"] == 8.0 and worst["rgb_ncc"]["value"] == worst["rgb_ncc"]["coverage"] == 0.0
 
 
+@pytest.mark.minute
 def test_a_leaderboard_has_every_run_and_compares_none_that_leaves_something_out(files, truth, tmp_path, capsys):
     near = write_depth(files, tmp_path / "near", lambda depth_m, _: depth_m + 0.001 * (depth_m > 0))
     far = write_depth(files, tmp_path / "far", lambda depth_m, _: depth_m + 0.006 * (depth_m > 0))
@@ -431,6 +438,7 @@ def test_p_values_are_corrected_as_holm_published():
         assert [row["better"] for row in rows] == [*("a" if p < 0.05 else None for p in corrected), None]
 
 
+@pytest.mark.minute
 def test_predictions_are_checked_without_a_score(files, truth, tmp_path, capsys):
     status, answer, _ = score(capsys, "check", files.root, truth)
     assert (status, answer["items"], answer["missing"]) == (0, 3 * PAIRS, 0)

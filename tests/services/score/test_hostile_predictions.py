@@ -156,7 +156,13 @@ def root(tmp_path_factory):
     return str(make_dataset(tmp_path_factory.mktemp("hostile"), scenes=5, categories=["box"], targets=targets)[0].root)
 
 
-@pytest.mark.parametrize("count", [30, pytest.param(1000, marks=(pytest.mark.slow, pytest.mark.timeout(3000)))])
+@pytest.mark.parametrize(
+    "count",
+    [
+        pytest.param(30, marks=pytest.mark.minute),
+        pytest.param(1000, marks=(pytest.mark.slow, pytest.mark.timeout(3000))),
+    ],
+)
 @pytest.mark.parametrize("kind", first_of(FORMATS, 4))
 def test_mutants_are_scored_or_refused_in_a_line_and_nothing_else(root, kind, count, tmp_path, capfd):
     ends, seconds = {"ok": 0, "refused": 0, "missing": 0}, []
@@ -200,8 +206,9 @@ IRREGULAR = {
 """How it is made, and what is said of it."""
 
 
-@pytest.mark.parametrize(("make", "told"), IRREGULAR.values(), ids=IRREGULAR)
-def test_what_is_no_file_of_the_folder_is_refused_in_every_format(root, make, told, tmp_path):
+@pytest.mark.parametrize("what", first_of(IRREGULAR, 2))
+def test_what_is_no_file_of_the_folder_is_refused_in_every_format(root, what, tmp_path):
+    make, told = IRREGULAR[what]
     pair, _, truth = pair_of(root)
     folder, kinds = tmp_path / "given", {kind.partition(" ")[0] for kind in FORMATS} - {"pose"}
     waiting = {kind: [other.mirror.pose_id for other in open_dataset(root).pairs()][1:] for kind in kinds}
@@ -248,14 +255,12 @@ def hungry(mesh):
     return ".obj", mesh.export(file_type="obj").encode() + b"\nvt 0 0" * 9_000_000
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize(
     ("limit", "most", "spoil", "told"),
     [
         ("MOST_MIB", 1024, hungry, "more (memory than there is|than 1024 MiB of memory): make it smaller"),
-        pytest.param(
-            *("MOST_CPU_S", 1.5, slow, "takes more than 1.5 s of processor time: make it smaller"),
-            marks=pytest.mark.minute,
-        ),
+        ("MOST_CPU_S", 1.5, slow, "takes more than 1.5 s of processor time: make it smaller"),
     ],
 )
 def test_an_item_beyond_a_limit_is_refused_and_all_others_are_scored(

@@ -194,6 +194,7 @@ def test_a_body_looks_the_same_after_as_many_turns_as_its_group_has_and_those_co
         assert scores["add_s_m"] < 0.002
 
 
+@pytest.mark.minute
 def test_what_is_aligned_is_what_was_asked_for():
     rng = np.random.default_rng(6)
     true = rng.uniform(1.0, 3.0, (40, 50))
@@ -287,6 +288,7 @@ def box_samples(half, count, rng):
     return points, axis
 
 
+@pytest.mark.minute
 def test_boxes_differ_as_their_geometry_says_within_the_stated_sampling_error():
     rng, off = np.random.default_rng(7), []
     for _ in range(CASES):
@@ -327,6 +329,7 @@ def test_the_common_volume_of_closed_boxes_is_exact_however_they_are_wound_or_cu
         agree((ours["iou"], ours["iou.sampling"]), (common / (8 * a.prod() + 8 * b.prod() - common), 0.0))
 
 
+@pytest.mark.minute
 def test_the_common_volume_of_open_shapes_is_where_solid_angles_say_inside():
     rng, off = np.random.default_rng(9), []
     for _ in range(CASES):

@@ -124,6 +124,7 @@ def test_the_machine_the_command_and_what_was_left_out_are_named():
     } <= set(lines)
 
 
+@pytest.mark.minute
 def test_every_study_has_a_picture_and_the_same_study_the_same_bytes():
     """Of long names, many knobs, points that lie on one another, errors of 0, and a job alone."""
     names = [f"a long name of knob {n}=a long value of it {k}" for n in range(9) for k in range(4)]

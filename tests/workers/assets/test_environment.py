@@ -9,6 +9,7 @@ from schemas.base import Counts, Range
 from schemas.errors import AssetSourceError, JobError, MeshError
 from schemas.job.look import BUILT_IN, Environment, Lights
 from services.job.job_file import validate_job
+from tests.kit.tiers import first_of
 from workers.assets.look import environment
 from workers.assets.look.environment import load_map, open_maps
 from workers.assets.look.lights import draw_environment, draw_lights, planckian_rgb
@@ -66,7 +67,7 @@ REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", first_of(REFUSED, 5))
 def test_a_map_that_cannot_be_used_is_refused_by_name_before_the_run(name, tmp_path):
     write, message = REFUSED[name]
     write(tmp_path / name)

@@ -137,6 +137,7 @@ def test_points_are_uniform_by_area_and_have_the_colour_of_their_place():
     assert not drawn["surface_colors"][(x > 0.01) & (x < 0.49)].any()
 
 
+@pytest.mark.minute
 def test_an_opened_sphere_has_the_winding_numbers_of_its_solid_angle_and_says_how_much_is_open():
     ball = trimesh.creation.icosphere(4, 0.1)
     opened = trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 0.06], process=False)

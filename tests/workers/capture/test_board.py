@@ -141,6 +141,7 @@ def test_kalibrs_grid_is_found_where_its_target_file_has_it(tmp_path):
     assert (bits[top : top + len(theirs), left : left + len(theirs)] == theirs).mean() > 0.99
 
 
+@pytest.mark.minute
 def test_boards_of_other_programs_are_read_from_their_own_files(tmp_path):
     """A bundle's tags have their frame x to the right of the upright tag, y up, z out; the others list corners or sizes."""
 

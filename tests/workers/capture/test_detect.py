@@ -332,7 +332,10 @@ def test_the_axes_stand_on_the_print_in_the_picture(estimated):
 NEAR = {"views": 1, "image_scale": 0.5, "distance_m": [0.4, 0.45]}
 
 
-@pytest.mark.parametrize("settings", [{}, {"distortion": {"k1": 0.08, "k2": -0.05}}, {"motion_blur": 0.008}])
+@pytest.mark.parametrize(
+    "settings",
+    [{}, pytest.param({"distortion": {"k1": 0.08, "k2": -0.05}}, marks=pytest.mark.minute), {"motion_blur": 0.008}],
+)
 def test_each_row_is_seen_from_where_the_camera_is_when_it_is_read(settings):
     """Corners by OpenCV from the pose of their own row, which a few steps find; from the middle row's they are off by pixels."""
     view, camera, T = take_one(**NEAR, **settings, rolling_shutter=0.1)

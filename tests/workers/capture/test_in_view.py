@@ -72,6 +72,7 @@ OTHERS = {
 }
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("name", first_of(OTHERS, 1, 4))
 def test_a_board_that_is_not_board_jsons_is_named_and_the_command_that_is_printed_makes_the_capture_right(
     name, tmp_path
@@ -110,6 +111,7 @@ SECONDS = {
 }
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("name", first_of(SECONDS, 1, 4))
 def test_of_two_prints_in_view_the_one_that_the_object_stands_on_is_the_board(name, tmp_path):
     poses = photographed(tmp_path, Board(), views=6, beside=SECONDS[name])
@@ -151,6 +153,7 @@ HANDS = {
 }
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("name", first_of(HANDS, 1, 3))
 def test_a_hand_over_the_board_is_no_object_that_moved_and_in_no_cloud_or_mask(name, tmp_path):
     def beside(n):
@@ -183,6 +186,7 @@ def test_a_hand_over_the_board_is_no_object_that_moved_and_in_no_cloud_or_mask(n
 # ---------------------------------------------------------------------------------------------- by a ray caster not ours
 
 
+@pytest.mark.minute
 @pytest.mark.shared_data
 @pytest.mark.parametrize("name", ["hand", "spare_board"])
 def test_all_views_of_an_independent_capture_are_used_whatever_lies_beside_the_object(name, tmp_path):

@@ -321,6 +321,7 @@ def test_a_capture_is_processed_without_a_file_more_or_less_in_its_folder():
     assert set(done.score.views) == {view.number for view in used} and done.images(used[0].number).mask.any()
 
 
+@pytest.mark.minute
 def test_without_truth_there_is_no_score(tmp_path):
     bare = copy_of(box(), tmp_path)
     shutil.rmtree(bare / "truth")

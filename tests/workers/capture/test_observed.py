@@ -140,6 +140,7 @@ def test_26_markers_at_a_fifth_of_a_pixel_give_a_fifth_of_a_millimetre(camera):
     assert 0.1 < mm < 0.3 and 0.008 < degrees < 0.025
 
 
+@pytest.mark.minute
 def test_the_covariance_tells_the_errors():
     rng, squares = np.random.default_rng(1), []
     for T in hand_held(rng, 100):

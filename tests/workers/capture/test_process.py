@@ -96,6 +96,7 @@ def test_poses_of_a_drawn_capture_are_the_true_ones_and_the_same_bytes_twice(dra
     assert list(alone.by_name) == ["markers"] and set(alone.seconds) == {"read", "detect", "sample"}
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("frame", ["centre", "opencv", "opencv_old"])
 def test_poses_that_were_given_are_read_in_the_frame_that_the_flag_names(copy, drawn, frame):
     text = (copy / "capture.json").read_text().replace('"centre"', f'"{frame}"')
@@ -139,6 +140,7 @@ def rewrite(path, **numbers):
     (path / "camera.json").write_text(json.dumps(spec | {k: v(spec.get(k)) for k, v in numbers.items()}))
 
 
+@pytest.mark.minute
 def test_a_folder_that_was_processed_with_the_markers_camera_is_read_back_with_it(tmp_path):
     path = copy_of(box(), tmp_path)
     rewrite(path, cx=lambda cx: cx + 8)
@@ -152,6 +154,7 @@ def test_a_folder_that_was_processed_with_the_markers_camera_is_read_back_with_i
     assert done.estimates.estimate.views[0].T_board_cam == pytest.approx(read_truth(path).T_board_cam[0], abs=5e-3)
 
 
+@pytest.mark.minute
 @pytest.mark.shared_data
 @pytest.mark.parametrize(
     ("file", "words", "right"),
@@ -294,6 +297,7 @@ def turn(path, number):
         cv2.imwrite(file, cv2.imread(file, cv2.IMREAD_UNCHANGED)[::-1, ::-1])
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("seed", SEEDS)
 def test_an_image_that_is_turned_is_refused_and_spoils_nothing_else(seed, tmp_path):
     kept = made(seed, views=VIEWS, image_scale=0.35, depth_noise=KinectDepthNoise())
@@ -318,6 +322,7 @@ def test_where_markers_fit_the_board_no_other_board_is_looked_for(tmp_path, monk
     assert refused.value.reason == "poses"
 
 
+@pytest.mark.minute
 @pytest.mark.shared_data
 def test_views_far_apart_of_an_object_that_never_moved_are_all_used(tmp_path):
     """The mug of ../shared/data/captures: five views, and every second photograph without depth."""
@@ -333,6 +338,7 @@ def test_views_far_apart_of_an_object_that_never_moved_are_all_used(tmp_path):
 # ---------------------------------------------------------------------------------------------- manual corrections
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("estimate", ["markers", "joint"])
 def test_a_manual_correction_moves_its_pose_and_notes_are_there_once(estimate, tmp_path):
     path, watch = copy_of(box(), tmp_path), processor_clock()
@@ -405,6 +411,7 @@ def test_every_view_has_its_files_near_the_truth_and_process_json_names_them():
         assert (mask & true).sum() / (mask | true).sum() > 0.93
 
 
+@pytest.mark.minute
 def test_a_second_run_writes_the_same_bytes_and_keeps_what_the_user_changed(tmp_path):
     def results(path):
         record = json.loads((path / "process.json").read_bytes())
@@ -504,6 +511,7 @@ def test_a_mirror_view_stands_on_the_other_side_and_shows_the_true_depth(result)
     assert result.synthesize(own).sources[0] == 4 and 4 not in result.synthesize(own, without=4).sources
 
 
+@pytest.mark.minute
 def test_synthesised_views_are_written_with_pose_and_shares_and_never_into_the_capture(result, tmp_path):
     T = result.estimate.views[2].T_board_cam
     told = write_synthesized(result, T, tmp_path / "views")
@@ -527,6 +535,7 @@ def test_synthesised_views_are_written_with_pose_and_shares_and_never_into_the_c
 # ---------------------------------------------------------------------------------------------- scores
 
 
+@pytest.mark.minute
 def test_the_score_of_a_good_capture_is_good_and_poses_that_are_off_are_told_by_as_much(result):
     truth = read_whole_truth(result.folder)
     score = score_capture(result, truth, held_out=3)

@@ -227,6 +227,7 @@ def board_depth(capture, number, shift=(0.0, 0.0, 0.0)):
     return depth[chosen], plane[chosen]
 
 
+@pytest.mark.minute
 def test_depth_of_the_board_is_that_of_its_plane_with_the_errors_that_were_asked_for():
     for number in (0, 1):
         found, expected = board_depth(made(**SMALL), number)

@@ -258,6 +258,7 @@ def test_what_one_view_alone_shows_is_left_out():
     assert np.quantile(off_mm, 0.95) < 2.0 and off_mm.max() < 12.0
 
 
+@pytest.mark.minute
 def test_the_silhouette_is_the_objects_and_its_walls_reach_the_board_and_no_farther():
     views, found = fused()
     region = find_object(views, BOARD, Fusion())
@@ -317,6 +318,7 @@ def test_a_thin_floor_is_in_the_cloud_and_a_hole_shows_the_board(record_figure):
     assert not (np.abs(hole[:, :2]) < 0.035).all(axis=1).any() and not find_object(ring, BOARD, Fusion()).floor.any()
 
 
+@pytest.mark.minute
 @pytest.mark.shared_data
 @pytest.mark.parametrize(("name", "complete"), [("m_ref", 0.965), ("m_five", 0.94)])
 def test_the_mug_of_an_independent_caster_is_whole_and_its_rim_is_not_frayed(name, complete, record_figure):

@@ -238,6 +238,7 @@ def test_what_is_called_measured_lies_on_the_object_or_the_board_whatever_single
     assert (view.measured & view.mask).sum() > 0.8 * view.mask.sum()
 
 
+@pytest.mark.minute
 def test_what_no_view_sees_of_the_object_is_its_own_and_counts_as_not_measured():
     camera, place = camera_at(0.3, 0.1, 0.7), (0.03, 0.0)
 

@@ -230,6 +230,7 @@ def test_bodies_that_share_points_or_edges_and_overlap_weigh_as_their_union_and_
     assert asset.mass.mass_kg == pytest.approx(0.6, rel=1e-9) and not place(hollow[0]).notes
 
 
+@pytest.mark.minute
 def test_bodies_shown_more_than_once_weigh_once_and_very_many_that_meet_are_said():
     """A body repeated in the same place is one; crossing bodies are joined, or the note says that they are not."""
     one, far = cube((0, 0, 0), (1, 1, 1)), cube((0.5, 0.5, 0.5), (3, 1, 1))

@@ -116,6 +116,7 @@ def test_whether_loops_are_kept_is_known_without_numba_by_what_is_there_of_every
     assert said(start(tmp_path, ask)) == ["False"]
 
 
+@pytest.mark.minute
 def test_processes_that_start_at_once_share_the_planned_loops_and_later_ones_read_them(tmp_path):
     project(tmp_path, 0.3, **{name: ONE_LOOP.replace("compiled", 'compiled_for("i8")') for name in NAMES})
     program = TOGETHER.replace("kept(", "a.kept(")

@@ -136,6 +136,7 @@ def test_a_shape_whose_outlines_meet_or_cross_has_parts_all_the_same():
             assert corners == pytest.approx(bound(asset.shape.vertices, axis=0), abs=1e-9)
 
 
+@pytest.mark.minute
 def test_a_solid_that_large_tolerances_leave_with_more_faces_is_made_coarser_in_turn_and_it_ends(monkeypatch):
     """What wraps an open ring: at once by ever larger tolerances it never has fewer than 1,796 faces."""
     ring = trimesh.creation.annulus(0.06, 0.1, 0.1, sections=96)

@@ -18,6 +18,7 @@ from tests.hard_cases.groups import place as at
 from tests.hard_cases.groups import put, together, tray
 from tests.hard_cases.hollow_cases import cups
 from tests.kit.shapes import asset_of, box
+from tests.kit.tiers import first_of
 from tests.physics.settling import (
     PHYSICS,
     effects_of,
@@ -341,7 +342,7 @@ def test_what_finds_no_balance_is_removed_where_what_leaves_is(monkeypatch):
         settle_scene(scene_of(starts, TABLE), PHYSICS, EffectPlan(ALL, {}))
 
 
-@pytest.mark.parametrize("pouring", [NOTHING_MORE, Pouring(remove=True)])
+@pytest.mark.parametrize("pouring", first_of([NOTHING_MORE, Pouring(remove=True)], 1))
 @pytest.mark.parametrize("push_m_s", [(40.0, 0.0, 0.0), (0.0, 0.0, 10.0)])
 def test_what_was_thrown_is_told_so_and_never_rests_nor_counts_as_lost(push_m_s, pouring, monkeypatch):
     """Whatever throws the second of two, here a push as its fall begins; upwards it comes down on the table again."""
@@ -389,6 +390,7 @@ def test_only_thin_walls_that_may_lie_in_one_another_fall_as_coarser_parts(bodie
     assert given and all(most / 10 < max(counts) < most for counts in given)
 
 
+@pytest.mark.minute
 def test_six_cups_come_to_rest_one_after_the_other_and_only_neighbours_are_compared_when_let_go(monkeypatch):
     """A cup's wall is in the box of each cup within its height, and touches those of the next alone. Here they stay."""
     apart = []

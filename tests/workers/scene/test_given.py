@@ -109,6 +109,7 @@ def test_a_finished_dataset_as_a_table_gives_every_image_byte_for_byte(drawn, ag
     assert replay_scene(again, 1).differences == ()
 
 
+@pytest.mark.minute
 def test_another_tier_and_other_cameras_keep_the_geometry(drawn, tmp_path):
     flat = make_dataset(
         tmp_path / "flat", **overlaid(THREE, {"scenes_from": str(drawn.root), "render": {"tier": "flat"}})
@@ -126,6 +127,7 @@ def test_another_tier_and_other_cameras_keep_the_geometry(drawn, tmp_path):
     assert bodies == [[(b["instance_id"], b["T_world_obj"]) for b in row["bodies"]] for row in rows_of(drawn, "scenes")]
 
 
+@pytest.mark.minute
 def test_clutter_falls_over_a_kept_scene_and_moves_nothing(again, tmp_path):
     look = {"look": {"clutter": {"count": [3, 3]}}, "scenes_from": str(again.root)}
     strewn = make_dataset(tmp_path / "out", **overlaid(THREE, look))[0]
@@ -136,6 +138,7 @@ def test_clutter_falls_over_a_kept_scene_and_moves_nothing(again, tmp_path):
         assert now["surroundings"]["clutter"] and {"kept_poses", "dynamics"} <= set(now["effects"])
 
 
+@pytest.mark.minute
 def test_a_bop_scene_of_our_shapes_is_rebuilt_to_a_hundredth_of_a_millimetre_and_exported_alike(drawn, tmp_path):
     export_to(drawn, tmp_path / "bop", "bop")
     folders = sorted(path.parent for path in (tmp_path / "bop").glob("*/*/scene_gt.json"))
@@ -447,6 +450,7 @@ print(next(line.split()[1] for line in open("/proc/self/status") if line.startsw
 """
 
 
+@pytest.mark.minute
 def test_a_worker_holds_a_few_scenes_of_a_million_rows(tmp_path):
     """Its memory is that of a thousand rows and a few blocks, though all rows are in one group."""
     peaks = []

@@ -156,6 +156,7 @@ def test_a_room_that_the_table_or_a_camera_does_not_fit_into_is_a_failure_with_t
 ALL_TARGETS = {"views": ["normals", "coordinates", "albedo", "covisible", "amodal", "layers"]}
 
 
+@pytest.mark.minute
 def test_clutter_is_in_images_masks_and_depth_and_has_no_row():
     clutter: dict[str, Any] = {"clutter": {"count": 3, "categories": {"box": 1}}}
     changes = {"targets": ALL_TARGETS, "check": {"raycast_share": 1.0}, "objects_per_scene": 2}
