@@ -113,6 +113,7 @@ def test_a_store_without_conditional_puts_is_refused_before_anything_is_made(con
     assert bucket.objects == {}
 
 
+@pytest.mark.minute
 def test_a_store_whose_quota_is_used_up_at_any_put_loses_nothing(tmp_path):
     expected = on_disk(tmp_path)
     whole = Bucket()

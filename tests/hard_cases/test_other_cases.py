@@ -13,7 +13,14 @@ from workers.render.raster.gbuffer import shared_renderer
 OF_SECONDS = {
     *("a shiny half without depth", "a shiny spot without depth that moves with the camera"),
     *("a transparent sphere in front of a box", "no depth on half of the board", "board at 80 degrees"),
-    *("print seen in a mirror", "wrong dictionary", "wrong board"),
+    *(
+        "print seen in a mirror",
+        "wrong dictionary",
+        "wrong board",
+        "frontal board",
+        "small marker",
+        "three markers in one view",
+    ),
 }
 """Cases of two seconds and more, of which the default suite has one or two of each kind."""
 

@@ -177,6 +177,7 @@ def test_tumbling_drops_end_as_they_do_with_the_finest_steps(name, drops, fine_h
     assert p > SIGNIFICANCE
 
 
+@pytest.mark.minute
 def test_the_test_of_shares_notices_that_faces_were_swapped():
     ours = drop_many(body("hull"), PHYSICS, 0, 100)
     assert alike(ours, np.roll(ours, 1)) < SIGNIFICANCE

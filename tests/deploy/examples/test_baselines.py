@@ -117,6 +117,7 @@ def test_the_page_s_table_is_that_of_its_rows_which_are_of_the_job_as_it_is():
     assert digest in page and len(re.findall(r"\b[0-9a-f]{64}\b", page)) == 2
 
 
+@pytest.mark.minute
 def test_no_shapes_of_two_splits_are_alike_and_the_check_measures_it(few, tmp_path, capsys):
     balls = [trimesh.creation.icosphere(4, radius) for radius in (0.1, 0.102)]
     a, b = (split_by_distance.sample(ball.vertices, ball.faces) for ball in balls)

@@ -83,6 +83,7 @@ def test_a_cloud_lies_on_the_mesh_in_every_frame(pairs):
         assert len(view.cloud("world", 1).points) and np.abs(view.cloud("world", 1).points[:, 2]).max() < 2 * UNIT_M
 
 
+@pytest.mark.minute
 def test_targets_are_the_mesh_in_numbers(pairs):
     for _, view in views_of(pairs):
         segment, normals, coordinates = view.segment(), view.normals(), view.coordinates()
@@ -128,6 +129,7 @@ def test_thickness_is_the_way_from_the_first_surface_to_the_last(pairs):
             assert not len(rows) or (np.abs(cast - thickness[rows, columns]) < 5 * UNIT_M).mean() > 0.95
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("back", [False, True])
 def test_no_pixel_off_outlines_is_seen_or_hidden_wrongly(pairs, back, record_figure):
     """Rays from the other camera to what exact rays of this one meet; an outline, of either image, is a pixel wide."""

@@ -101,6 +101,7 @@ def test_cameras_stand_where_the_views_were_taken_from(pile, exported):
     assert perspective["aspectRatio"] == pytest.approx(160 / 120)
 
 
+@pytest.mark.minute
 def test_walls_and_clutter_stand_where_the_scene_has_them(tmp_path):
     look = {"room": True, "clutter": {"count": 2}, "environment": {"built_in": ["window_room"]}}
     store, _ = make_dataset(tmp_path / "out", scenes=1, categories=["can"], look=look)

@@ -188,6 +188,7 @@ def test_distances_are_in_units_of_the_longest_side_from_the_middle_of_the_box(r
                 np.testing.assert_allclose(shot.T[:3, 3], unit * (place - origin), atol=1e-9)
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize(("name", "tolerance"), [("instantmesh", 0.6 * STEP), ("trellis", 2e-4)])
 def test_depth_lies_on_the_object(name, tolerance, read, studio):
     for scene_id, shots in read[name].items():

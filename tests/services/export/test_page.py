@@ -40,6 +40,7 @@ def test_every_command_of_the_page_exports(folder):
         assert (folder / words[2] / "export.json").exists() and not (folder / words[2] / "_export").exists()
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("example", EXAMPLES)
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
 def test_the_examples_run(example, folder, monkeypatch):

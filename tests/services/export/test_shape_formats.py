@@ -134,6 +134,7 @@ def test_an_object_of_train_has_no_image_of_a_scene_that_shows_one_of_test(heap,
 # ------------------------------------------------------------------------------------------------ PCN
 
 
+@pytest.mark.minute
 def test_partial_clouds_lie_on_the_complete_one_and_show_what_the_depth_shows(shaped, exported):
     folder, manifest = exported["pcn"]
     samples = {one.name: (split, one) for split in SPLITS for one in load_completions(folder, split)}

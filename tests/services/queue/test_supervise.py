@@ -191,6 +191,7 @@ def test_a_second_supervisor_that_acts_in_the_middle_of_any_step_or_in_turn_doub
     check_ends(world)
 
 
+@pytest.mark.minute
 def test_a_head_that_comes_back_and_knows_nothing_costs_an_attempt_and_no_job(tmp_path):
     for tick in range(1, 12):
         world = world_of(tmp_path / str(tick))

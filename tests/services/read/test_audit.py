@@ -104,6 +104,7 @@ def write_fingerprint(store: LocalStore, changes: dict[str, str]) -> None:
     store.put(FINGERPRINT_FILE, fingerprint.model_copy(update=changes).model_dump_json().encode())
 
 
+@pytest.mark.minute
 def test_on_another_stack_a_plain_scene_is_compared_and_a_scene_made_otherwise_blames_no_effect(tmp_path):
     store, _ = run_here(TWO, tmp_path)
     with mock.patch.object(workers.scene.pairs, "quantise_depth", lambda depth, _: (depth * 4999).astype(np.uint16)):

@@ -295,6 +295,7 @@ def test_a_run_in_which_nothing_begins_is_found_and_a_worker_between_scenes_has_
     assert after_s > COMMIT_FACTOR * LIMIT_S
 
 
+@pytest.mark.minute
 def test_a_store_that_does_not_answer_for_a_while_is_no_stall(store, monkeypatch):
     """The looks that fail count as time, but never as a look."""
     begin_attempt(store, Span(start=4, stop=8), TERMS, "label").begin_scene(5)

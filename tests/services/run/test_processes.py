@@ -237,6 +237,7 @@ def test_a_command_that_ignores_the_interrupt_is_killed_by_a_second_one():
     assert end(run) == (1, "", "verso: interrupted; all is kept\n")
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize(
     "killed",
     [(0,), (1,), (2,), *(pytest.param(several, marks=pytest.mark.minute) for several in ((0, 2), (1, 2), (0, 1, 2)))],

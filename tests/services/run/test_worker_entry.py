@@ -56,6 +56,7 @@ print(*sorted({"numpy", "pydantic", "cv2", "OpenGL", "pybullet"} & set(sys.modul
 """
 
 
+@pytest.mark.minute
 def test_a_worker_is_refused_before_anything_heavy_loads_and_goes_on_where_it_has_what_the_driver_has():
     """Before it unpacks what it was given, too, which other code could not."""
     terms = replace(terms_of_driver(), environment=(("NPY_DISABLE_CPU_FEATURES", "X86_V4"),))

@@ -104,6 +104,7 @@ def test_colour_agrees_with_skimage_and_with_the_package_of_flip(cases):
         assert score_colour(predicted, true, {}, flip=False)["image.flip"] is None
 
 
+@pytest.mark.minute
 @cases_each
 def test_ms_ssim_is_the_published_product_of_five_scales(cases):
     rng = np.random.default_rng(3)

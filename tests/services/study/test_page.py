@@ -18,6 +18,7 @@ from tests.kit.html import Reader
 from tests.services.study.made_up import read_study, row, stored, study
 
 
+@pytest.mark.minute
 def test_a_study_comes_back_exactly_and_nothing_else_is_left(tmp_path: Path):
     odd = row("a=1", 0.5, flip=0.1 + 0.2, depth_mm=1e-300)
     odd = dataclasses.replace(odd, errors={**odd.errors, "gap_mm": Figure(0.1, 0.1, 0.1, 0.1, math.inf, 1)})

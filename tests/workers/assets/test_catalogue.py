@@ -143,6 +143,7 @@ def test_the_digest_knows_every_byte_setting_and_category_but_not_where_the_fold
     assert len({same, *others}) == 1 + len(others)
 
 
+@pytest.mark.minute
 def test_an_opened_catalogue_travels_small_and_loads_the_same_asset_in_another_process(tmp_path):
     catalogue = opened(tmp_path)
     ref = choose_object(catalogue, "mug", np.random.default_rng(3))

@@ -132,6 +132,7 @@ def test_the_shapes_of_the_surfaces_help_views_with_few_markers():
     assert of_few[2][0] < 1.05 * of_few[1][0]
 
 
+@pytest.mark.minute
 def test_depth_tells_apart_what_markers_do_not():
     """One small marker, far off: both tilts fit; the tilt of the board in depth decides."""
     truth, evidence = make(Virtual(views=10, few=(2, 5), few_ids=(0,), k=HALF))
@@ -160,6 +161,7 @@ def test_a_pose_given_by_hand_is_kept_to_the_bit(capture):
     assert found.views[3].reasons[-1] == "as told" and median_errors(found, truth)[0] < 0.5
 
 
+@pytest.mark.minute
 def test_of_an_object_that_moved_the_largest_group_of_views_is_used_and_no_group_of_two(capture):
     truth, evidence = capture
     still = estimate_joint(evidence)

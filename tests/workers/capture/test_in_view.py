@@ -122,6 +122,7 @@ def test_of_two_prints_in_view_the_one_that_the_object_stands_on_is_the_board(na
     assert "a second print of the board is in view" in made.estimates.estimate.notes[0]
 
 
+@pytest.mark.minute
 def test_a_view_of_the_second_print_alone_has_no_pose(tmp_path):
     aside = look_at(np.array([0.75, 0.3, 0.25]), np.array([0.68, 0.28, 0.0]))
     poses = photographed(tmp_path, Board(), views=3, beside=lambda n: [BESIDE], more=[aside])

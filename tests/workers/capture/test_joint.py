@@ -187,6 +187,7 @@ def test_views_are_grouped_by_where_the_object_stood(how):
         assert how == "far away" or not any(out.any() for out in clutter)
 
 
+@pytest.mark.minute
 def test_views_without_depth_or_too_unsure_of_their_poses_are_not_said_to_see_another_place():
     truth, evidence = make(Virtual(views=14, k=HALF))
     seen = [observe(T, np.random.default_rng(0)) for T in truth]

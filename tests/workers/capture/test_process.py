@@ -361,6 +361,7 @@ def test_a_manual_correction_moves_its_pose_and_notes_are_there_once(estimate, t
 # ---------------------------------------------------------------------------------------------- the surface
 
 
+@pytest.mark.minute
 def test_a_mask_of_the_user_is_kept_and_a_view_without_a_pose_or_a_capture_without_depth_is_refused(tmp_path):
     path, mask = copy_of(box(), tmp_path), np.zeros((378, 672), np.uint8)
     mask[200:300, 400:500] = 255
@@ -497,6 +498,7 @@ def test_a_folder_that_was_not_processed_or_whose_record_is_damaged_is_refused(t
 # ---------------------------------------------------------------------------------------------- views
 
 
+@pytest.mark.minute
 def test_a_mirror_view_stands_on_the_other_side_and_shows_the_true_depth(result):
     camera, d_z, view = result.mirror(5)
     T = result.estimate.views[5].T_board_cam

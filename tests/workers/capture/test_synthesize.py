@@ -223,6 +223,7 @@ def at_place(place, camera, size):
     return np.s_[v - size : v + size, u - size : u + size]
 
 
+@pytest.mark.minute
 def test_what_is_called_measured_lies_on_the_object_or_the_board_whatever_single_views_show():
     def spoil(depth_m, camera):
         depth_m, (true, thing, _) = depth_m.copy(), cast(THING, camera)

@@ -123,6 +123,7 @@ def test_shading_normals_of_the_file_follow_the_surface_and_point_outwards(tmp_p
     assert part.normals == pytest.approx(part.vertices, abs=1e-6)
 
 
+@pytest.mark.minute
 @pytest.mark.shared_data
 def test_scanned_things_come_in_closed_with_a_volume_that_their_own_collision_meshes_confirm():
     for name in ("blue_cup", "bowl", "cracker_box", "mug", "shampoo"):
@@ -304,6 +305,7 @@ def upright(mesh, up="z"):
     return find_upright(mesh.convex_hull.vertices @ turn, mesh.center_mass @ turn)
 
 
+@pytest.mark.minute
 def test_who_is_sure_is_right_and_who_finds_it_likely_is_so_nine_times_in_ten():
     likely, sure, seeds = [], dict.fromkeys((*CATEGORIES, TABLE), 0), 12
     for category in sure:

@@ -341,6 +341,7 @@ def test_a_mesh_that_a_urdf_names_a_thousand_times_is_read_once(tmp_path, monkey
     assert len(read) == 1
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("text", ["map_Kd skin.png\n" * 100_000, "".join(f"map_Kd {k}.png\n" for k in range(100_000))])
 def test_a_material_file_that_names_pictures_without_end_is_read_for_as_long_as_a_mesh_may_have_parts(tmp_path, text):
     """Took 30 s of processor time and more."""

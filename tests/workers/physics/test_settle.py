@@ -230,6 +230,7 @@ def test_what_gains_energy_falls_again_in_shorter_steps_until_it_gains_none(monk
 # ---------------------------------------------------------------------------------------------- let go again
 
 
+@pytest.mark.minute
 def test_a_cube_beside_a_wall_that_is_let_go_again_keeps_all_four_of_its_corners_on_the_floor():
     """Bullet keeps four contacts of two bodies, chosen for their area, up to millimetres away; those of a wall count."""
     walled, aside = tray(), turn(Z, 0.0785)
@@ -405,6 +406,7 @@ def test_six_cups_come_to_rest_one_after_the_other_and_only_neighbours_are_compa
     assert apart == [{(i, j) for j in range(6) for i in range(j - 1)}]
 
 
+@pytest.mark.minute
 def test_letting_go_ends_at_its_budget_and_names_the_objects(monkeypatch):
     monkeypatch.setattr(settle, "LET_GO_COST", 0.0)
     group = cups(2)
