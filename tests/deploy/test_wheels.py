@@ -188,7 +188,8 @@ def environment_of(installation: str, built: Path, folder: Path) -> dict[str, st
 @pytest.mark.minute
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(
-    ("page", "installation"), [*((page, "reader") for page in READERS), ("docs/reading.md", "data")]
+    ("page", "installation"),
+    [*((page, "reader") for page in READERS), pytest.param("docs/reading.md", "data", marks=pytest.mark.slow)],
 )
 def test_blocks_of_pages_run_as_typed_from_a_wheel_outside_of_any_checkout(page, installation, built, tmp_path):
     """Python's blocks in one process."""

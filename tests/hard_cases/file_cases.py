@@ -72,6 +72,6 @@ FROM_FILES = (
             tier=tier,
             again="slow",
         )
-        for count, tier in ((10, ""), (20, "slow"))
+        for count, tier in ((10, "minute"), (20, "slow"))
     ),
 )

@@ -291,7 +291,7 @@ HOLLOWS = (
         tier="minute",
         again="slow",
     ),
-    settles("two tapered cups in one another", lifted(fitting_m(), 0.2), lambda: cups(2)),
+    settles("two tapered cups in one another", lifted(fitting_m(), 0.2), lambda: cups(2), tier="minute"),
     settles(
         "three tapered cups in one another",
         both(lifted(fitting_m(), 0.2), tilts(0, 0, 0, bound_deg=1.0)),

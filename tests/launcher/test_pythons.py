@@ -221,7 +221,7 @@ def add_source(checkout: Checkout, remark: str) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-@pytest.mark.minute
+@pytest.mark.slow
 def test_a_compiled_pybullet_is_kept_by_its_sources_hash_and_half_of_one_never(checkout):
     """With pip itself: the interpreter says that it is another one than it is."""
     checkout.has("3.12")

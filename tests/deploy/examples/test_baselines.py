@@ -73,7 +73,7 @@ def test_level_3_has_the_pixels_that_the_same_job_with_noise_stores(small, tmp_p
     assert patches > 0
 
 
-@pytest.mark.minute
+@pytest.mark.slow
 def test_baselines_without_a_network_repeat_and_rank_as_they_must(small, tmp_path):
     names = [name for name in baselines.BASELINES if name not in baselines.NETWORKS]
     rows = [row for name in names for row in baselines.run(name, small, tmp_path / "a")]

@@ -164,9 +164,9 @@ ENDS = ([signal.SIGKILL] * 3, [signal.SIGINT], [signal.SIGHUP])
 
 
 @pytest.mark.ray
-@pytest.mark.minute
+@pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("ends", [ENDS[:1], pytest.param(ENDS[1:], marks=pytest.mark.slow)], ids=["a kill", "the rest"])
+@pytest.mark.parametrize("ends", [ENDS[:1], ENDS[1:]], ids=["a kill", "the rest"])
 def test_submit_and_supervise_are_the_whole_queue_of_one_machine_and_every_end_leaves_nothing(ends, tmp_path):
     _, digest = run_here(load_job(TABLETOP, ["scenes=4"]), tmp_path / "alone")
     machine, before = Machine(tmp_path), folders()

@@ -163,7 +163,7 @@ def root(tmp_path_factory):
         pytest.param(1000, marks=(pytest.mark.slow, pytest.mark.timeout(3000))),
     ],
 )
-@pytest.mark.parametrize("kind", first_of(FORMATS, 4))
+@pytest.mark.parametrize("kind", first_of(FORMATS, 4, 6))
 def test_mutants_are_scored_or_refused_in_a_line_and_nothing_else(root, kind, count, tmp_path, capfd):
     ends, seconds = {"ok": 0, "refused": 0, "missing": 0}, []
     items = write_mutants(root, kind, count, tmp_path)

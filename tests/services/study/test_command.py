@@ -100,7 +100,7 @@ def test_the_same_command_measures_nothing_twice_and_a_longer_budget_goes_on(mea
     assert code == 2 and "another study" in text and "--out" in text
 
 
-@pytest.mark.minute
+@pytest.mark.slow
 def test_a_target_writes_the_job_with_the_cheapest_setting_that_meets_it(measured, capsys):
     words = ["--target", "depth_mm=0.3,kept_share=0.9", "--budget", "76s", "--json"]
     assert main(["tradeoff", TABLETOP, "--out", str(measured), *SMALL, *words]) == 0
