@@ -118,7 +118,7 @@ class ScenePlan:
     more: tuple[NamedCamera, ...] = ()
     """Further cameras that stand by themselves; known where the objects rest."""
     kept: bool = False
-    """Whether the objects stay where a table of scenes has them, at rest or not."""
+    """Whether objects, those that are `placed`, stay where a table of scenes has them, at rest or not."""
     aimed: bool = False
     """Whether a table of scenes has the input cameras."""
     surroundings: Mapping[str, object] | None = None

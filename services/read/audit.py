@@ -25,7 +25,7 @@ from schemas.scene.view import MODALITIES, Camera, View
 from services.job.record import JobRecord, read_success, require_job
 from services.read.dataset_reader import ReadFile, StoredRange, choose_scenes, committed_reader, file_reader, find_scene
 from services.read.independent.cameras import read_stands
-from services.read.independent.derive import Kind, StoredPair
+from services.read.independent.derive import FIRST_OBJECT, Kind, StoredPair
 from services.read.independent.poses import check_forces, check_merged, check_pair, list_underived
 from services.read.replay import compare_files, compare_rows, is_same_stack, open_context
 from services.read.scene_geometry import Sources
@@ -234,13 +234,17 @@ def verify_independently(
         scene = stored.scene(scene_id)
         images = file_reader(committed_reader(store, stored.records), stored.records)
         assert scene is not None
-        verdict.faults += check_forces(job, scene)
-
         stands, given = {name: read_stands(path, scene_id) for name, path in tables.items()}, None
+        fallen = set[int]()
         if catalogue and catalogue.scenes is not None:
             rows = read_scene(catalogue.scenes, scene_id)
-            objects_there = [(each.instance_id, None if each.of_source else each.T_world_obj) for each in rows.objects]
-            given = objects_there, [T for T, _ in rows.cameras]
+            kept = [None if each.of_source or each.settle else each.T_world_obj for each in rows.objects]
+            given = (
+                [(each.instance_id, T) for each, T in zip(rows.objects, kept, strict=True)],
+                [T for T, _ in rows.cameras],
+            )
+            fallen = {FIRST_OBJECT + number for number, each in enumerate(rows.objects) if each.settle}
+        verdict.faults += check_forces(job, scene, fallen)
 
         def read(path: str, images: ReadFile = images) -> bytes:
             return store.read(path) if is_shape(path) else images(path)

@@ -12,10 +12,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from schemas.base import Pose
+from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
+from schemas.job.assets import TABLE
 from schemas.job.physics import Physics
-from schemas.scene.scene import EffectPlan, ObjectStart, ScenePlan, Settled
+from schemas.scene.scene import ContactForce, EffectPlan, ObjectStart, ScenePlan, Settled
+from schemas.scene.shape import REGION_TABLE, Mesh, Shape
+from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import translation
 from workers.geometry.mesh import join_meshes
 from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for, called_for_with, rooms_m
@@ -89,13 +92,7 @@ def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
     poses = tuple(start.T_world_obj for start in drop.starts)
     if not drop.effects.runs("dynamics"):
         return drop.starts, describe(Ending(drop, _place(drop, poses, forms), poses))
-    for i, j, depth_m in find_overlaps_m(forms, poses):
-        if depth_m > PLACED_M:
-            raise SettleError(
-                "objects_overlap",
-                f"regions {drop.starts[i].region_id} and {drop.starts[j].region_id} begin {depth_m * 1e3:.2f} mm inside one "
-                "another: let them go apart, or one above the other",
-            )
+    _require_apart(drop.starts, find_overlaps_m(forms, poses))
     if drop.physics.exact_rest and (placed := _rest_as_placed(drop, forms, poses)) is not None:
         return drop.starts, describe(placed)
     if drop.pouring.waves:
@@ -106,6 +103,17 @@ def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
         except LostError as lost:
             drop = _without_lost(drop, lost, again)
             forms = forms_of(drop.starts)
+
+
+def _require_apart(starts: Sequence[ObjectStart], overlaps: Iterable[tuple[int, int, float]], first: int = 0) -> None:
+    """Raises SettleError where two objects overlap, one of them from the number `first` on."""
+    for i, j, depth_m in overlaps:
+        if depth_m > PLACED_M and j >= first:
+            raise SettleError(
+                "objects_overlap",
+                f"regions {starts[i].region_id} and {starts[j].region_id} begin {depth_m * 1e3:.2f} mm inside one another: let "
+                "them go apart, or one above the other",
+            )
 
 
 def _without_lost(drop: Drop, lost: LostError, again: dict[int, int]) -> Drop:
@@ -329,30 +337,77 @@ def _settle_alone(
 
 
 def keep_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan, most_mm: float) -> Rest:
-    """The scene's objects where they were put, measured there: they need not rest. Clutter falls on them and on their table.
+    """The scene's objects where they were put, measured there: they need not rest. Those not `placed` fall on them and the table.
 
-    Raises as `describe_kept`; clutter that finds no rest is left out.
+    Clutter falls on all of it, and is left out where it finds no rest. Raises as `describe_kept` and `settle_scene`.
     """
-    drop = Drop(plan.shown, plan.table, physics, effects)
-    poses = tuple(start.T_world_obj for start in drop.starts)
-    for start in drop.starts:
+    placed = tuple(start for start in plan.shown if start.placed)
+    drop = Drop(placed, plan.table, physics, effects)
+    poses = tuple(start.T_world_obj for start in placed)
+    for start in placed:
         require_near_origin(start)
-    placement = _place(drop, poses, forms_of(drop.starts))
-    kept, clutter = describe_kept(Ending(drop, placement, poses), most_mm), plan.objects[len(poses) :]
-    if clutter and plan.ground is not None:
-        meshes = [drop.table.mesh, *map(placed_mesh, drop.starts, poses)]
-        table = dataclasses.replace(
-            drop.table, mesh=join_meshes(meshes), top=dataclasses.replace(drop.table.top, convex=False)
-        )
-        called = called_for(clutter, table, physics)
-        ground = dataclasses.replace(plan.ground, table=table)
+    rest = Rest(placed, describe_kept(Ending(drop, _place(drop, poses, forms_of(placed)), poses), most_mm))
+    if falling := tuple(start for start in plan.shown if not start.placed):
+        rest = _fall_over(plan, rest, falling, physics, effects)
+    if clutter := plan.objects[len(plan.shown) :]:
         with suppress(SettleError):
-            over = dataclasses.replace(plan, objects=clutter, ground=ground)
-            rest = settle_scene(over, physics, add_effects(effects, called))
-            return Rest(
-                (*drop.starts, *rest.starts), (*kept, *rest.settled), dict.fromkeys(sorted(called), "clutter falls")
-            )
-    return Rest(drop.starts, kept)
+            rest = _fall_over(plan, rest, clutter, physics, effects)
+    return rest
+
+
+def _fall_over(
+    plan: ScenePlan, rest: Rest, falling: Sequence[ObjectStart], physics: Physics, effects: EffectPlan
+) -> Rest:
+    """With these objects at rest on what lies still, as on one body with the least of its frictions. Raises SettleError."""
+    still, poses, ground = rest.starts, [each.T_world_obj for each in rest.settled], plan.ground
+    assert ground is not None
+    starts = (*still, *falling)
+    begin = (*poses, *(start.T_world_obj for start in falling))
+    _require_apart(starts, find_overlaps_m(forms_of(starts), begin), len(still))
+    meshes, shape = [plan.table.mesh, *map(placed_mesh, still, poses)], plan.table.asset.shape
+    closed = shape.closed and all(start.asset.shape.closed for start in still)
+    table = dataclasses.replace(
+        plan.table,
+        asset=dataclasses.replace(plan.table.asset, shape=Shape(shape.parts, closed), lofted=None),
+        mesh=join_meshes(meshes),
+        top=dataclasses.replace(plan.table.top, convex=False),
+    )
+    if isinstance(physics.friction, dict):
+        least = min(physics.friction_of(name) for name in (TABLE, *(start.asset.category for start in still)))
+        physics = physics.model_copy(update={"friction": {**physics.friction, TABLE: least}})
+    called = called_for(falling, table, physics)
+    over = dataclasses.replace(plan, objects=tuple(falling), ground=dataclasses.replace(ground, table=table))
+    fallen = settle_scene(over, physics, add_effects(effects, called))
+    own = [dataclasses.replace(b, region_id=a.region_id) for a, b in zip(falling, fallen.starts, strict=True)]
+    fallen = dataclasses.replace(fallen, starts=tuple(own))
+    late = dict.fromkeys(sorted(called), "not all poses are kept") | dict(fallen.called)
+    return _with_contacts(rest, fallen, meshes, {**rest.called, **late})
+
+
+def _with_contacts(rest: Rest, fallen: Rest, meshes: Sequence[Mesh], called: Mapping[str, str]) -> Rest:
+    """Both, in order of region: contacts with one body of the table and of what lies still are those with the nearest of these.
+
+    meshes: of the table, and of what lies still, world. What is not clutter is pressed in return by what fell on it.
+    """
+    settled, joined, ends = list(rest.settled), join_meshes(meshes), np.cumsum([len(mesh.faces) for mesh in meshes])
+    for start, each in zip(fallen.starts, fallen.settled, strict=True):
+        _, faces = distance_to_mesh(np.reshape([one.point for one in each.contacts], (-1, 3)), joined)
+        contacts = list(each.contacts)
+        for number, (contact, part) in enumerate(
+            zip(each.contacts, np.searchsorted(ends, faces, "right"), strict=True)
+        ):
+            if contact.with_region != REGION_TABLE or part == 0:
+                continue
+            below, point = settled[part - 1], contact.point
+            contacts[number] = dataclasses.replace(contact, with_region=rest.starts[part - 1].region_id)
+            if not start.is_clutter:
+                normal, force = frozen_array(-contact.normal), frozen_array(-contact.force)
+                pressed = (*below.contacts, ContactForce(start.region_id, point, normal, force))
+                settled[part - 1] = dataclasses.replace(below, contacts=pressed)
+        settled.append(dataclasses.replace(each, contacts=tuple(contacts)))
+    starts = (*rest.starts, *fallen.starts)
+    order = sorted(range(len(starts)), key=lambda number: starts[number].region_id)
+    return Rest(tuple(starts[k] for k in order), tuple(settled[k] for k in order), called)
 
 
 RECHECK_S = 1.0

@@ -311,12 +311,12 @@ SHARE = 0.01
 """Of a weight, or of a weight at the lever of the farthest contact: what may be without balance."""
 
 
-def check_forces(job: Mapping[str, Any], scene: Row) -> Iterator[str]:
-    """What the forces of a scene's contacts do not explain, a sentence each."""
-    bodies = scene["bodies"] if KEPT not in scene.get("effects", ()) else None
-    falls = job.get("captures") is None and job.get("scene") != "studio"
+def check_forces(job: Mapping[str, Any], scene: Row, fallen: Collection[int] = ()) -> Iterator[str]:
+    """What the forces of contacts do not explain, a sentence each. fallen: the regions that fell where others are kept."""
+    bodies, falls = scene["bodies"], job.get("captures") is None and job.get("scene") != "studio"
     if not bodies or not falls or not job["physics"]["exact_rest"]:
         return
+    kept = KEPT in scene.get("effects", ())
     where, frictions = f"scene {scene['scene_id']}", {TABLE: _friction_of(job, "table")}
     for body in (scene.get("surroundings") or {}).get("clutter") or ():
         frictions[body["region_id"]] = _friction_of(job, body["category"])
@@ -325,7 +325,7 @@ def check_forces(job: Mapping[str, Any], scene: Row) -> Iterator[str]:
         frictions[body["region_id"]] = expected if stored is None else stored
         if stored != (expected if isinstance(job["physics"]["friction"], dict) else None):
             yield f"{where}, region {body['region_id']}: its friction is {stored}, and physics.friction gives {expected:g}"
-    for body in bodies:
+    for body in (body for body in bodies if not kept or body["region_id"] in fallen):
         others = np.array([frictions.get(contact["with_region"], math.inf) for contact in body["contacts"]])
         friction = np.minimum(frictions[body["region_id"]] * others, MOST_FRICTION)
         yield from (f"{where}, region {body['region_id']}: {fault}" for fault in _check_body(body, friction))

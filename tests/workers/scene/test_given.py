@@ -252,6 +252,43 @@ def test_what_is_kept_is_measured_where_it_was_put_and_what_settles_falls(standi
     assert faults_of(store) == audit.verify_independently(store, 7, lambda _: None).faults == []
 
 
+def test_what_settles_falls_onto_what_is_kept_which_stays_and_both_have_the_contact(standing, tmp_path):
+    """A box on one that is kept in the air, and beside it one on the table; `physics.friction` is lower for what is kept."""
+    held, up, aside = moved(standing, z_mm=50.0), {"settle": True}, moved(standing, z_mm=80.0)
+    held[1, 3], aside[1, 3] = -0.06, 0.06
+    rows = [
+        row(0, moved(held, z_mm=300.0), **up),
+        row(0, held),
+        row(0, aside, **up),
+        {**row(0, moved(aside, z_mm=400.0)), "instance_id": None, "category": "can"},
+    ]
+    friction = {"box": 0.3, "table": 0.9}
+    store = made(
+        tmp_path, rows, scenes=1, categories=["box", "can"], physics={"friction": friction}, output={"layout": "tar"}
+    )
+    assert rows_of(store, "failures") == []
+    (scene,), (height_m,) = (
+        rows_of(store, "scenes"),
+        {
+            row["extents_m"][2]
+            for row in ds.dataset(store.root / "manifest" / "assets").to_table().to_pylist()
+            if row["instance_id"] == BOX
+        },
+    )
+    over, kept, beside, can = scene["bodies"]
+    assert kept["T_world_obj"] == held.ravel().tolist() and can["T_world_obj"][11] == aside[2, 3] + 0.4
+    assert {"kept_poses", "dynamics", "object_contacts", "table_mesh"} <= set(scene["effects"])
+    assert abs(over["T_world_obj"][11] - held[2, 3] - height_m) < 1e-5
+    assert abs(beside["T_world_obj"][11] - standing[2, 3]) < 1e-5
+    assert {contact["with_region"] for contact in over["contacts"]} == {4}
+    assert {contact["with_region"] for contact in beside["contacts"]} == {2}
+    assert {contact["with_region"] for contact in kept["contacts"]} == {3}
+    weight = sum(contact["force"][2] for contact in kept["contacts"])
+    assert weight == pytest.approx(-9.81 * over["mass_kg"], rel=1e-6)
+    assert audit.audit(store, 1, lambda _: None).faults == []
+    assert faults_of(store) == audit.verify_independently(store, 1, lambda _: None).faults == []
+
+
 CUBE, OPEN = asset_of(box(0.1, 0.1, 0.1)), box(0.1, 0.1, 0.1)
 OPEN.update_faces(OPEN.face_normals[:, 2] < 0.5)
 SMALL_CUBE, ON = asset_of(box(0.02, 0.02, 0.02)), place_table(table())
@@ -318,8 +355,8 @@ def test_a_row_that_cannot_be_fails_its_scene_alone_with_the_figure(standing, tm
         ([row(0, scaled)], "T_world_obj is no rotation"),
         ([row(0, standing), row(0, standing)], "rows 0 and 1 of scene 11 in"),
         (
-            [row(0, standing, settle=True), row(0, moved(standing, x_mm=300.0))],
-            "objects 0 have settle: true, and others do not",
+            [row(0, standing, settle=True), row(0, moved(standing, x_mm=5.0))],
+            "regions 4 and 3 begin ",
         ),
         ([row(0, standing, sha256="0" * 64)], "had 000000000000: its source, or Verso, is of another version"),
         (

@@ -52,19 +52,14 @@ def _find(catalogue: Catalogue, name: str, where: str, tables: bool = False) -> 
 
 def put_given(plan: ScenePlan, job: Job, given: GivenScene, assets: Sequence[Asset]) -> ScenePlan:
     """The plan with the table's objects, and with its cameras unless the job's always stand on the orbit. Raises StartError."""
-    if len({each.settle for each in given.objects}) > 1:
-        falls = ", ".join(str(number) for number, each in enumerate(given.objects) if each.settle)
-        raise StartError(
-            "settle_some", f"objects {falls} have settle: true, and others do not: give all of a scene the same"
-        )
-    kept, starts = not given.objects[0].settle, list[ObjectStart]()
+    starts = list[ObjectStart]()
     for number, (each, asset) in enumerate(zip(given.objects, assets, strict=True), start=REGION_FIRST_OBJECT):
         if each.sha256 not in (None, asset.sha256):
             shapes = f"{asset.instance_id} has the SHA-256 {asset.sha256[:12]}, and had {str(each.sha256)[:12]}"
             raise StartError("other_shape", f"{shapes}: its source, or Verso, is of another version: use that one")
         T = each.T_world_obj @ invert(asset.T_source_to_object) if each.of_source else each.T_world_obj
-        starts.append(ObjectStart(asset, hull_of(asset.shape), number, frozen_array(T), 0, kept))
-    plan = replace(plan, category=assets[0].category, objects=tuple(starts), kept=kept)
+        starts.append(ObjectStart(asset, hull_of(asset.shape), number, frozen_array(T), 0, not each.settle))
+    plan = replace(plan, category=assets[0].category, objects=tuple(starts), kept=any(one.placed for one in starts))
     if job.cameras.orbit.always or not given.cameras:
         return plan
     if len(given.cameras) < job.pairs_per_scene:
