@@ -138,9 +138,19 @@ def _on_ground(why_not: str, reason: Reason | None = None) -> Reason:
 
 
 def _in_motion(why_not: str, reason: Reason) -> Reason:
-    """An effect of what falls and rests, which a studio scene has no use for, nor one whose poses are kept."""
+    """An effect of what falls and rests, which a studio scene has no use for, nor one whose poses are kept.
+
+    What falls beside kept objects calls for it where it needs it, once these are measured.
+    """
     moved = _on_ground(why_not, reason)
-    return lambda facts: f"{KEPT}: {why_not}" if facts.plan.kept else moved(facts)
+
+    def skipped(facts: Facts) -> str | None:
+        if not facts.plan.kept:
+            return moved(facts)
+        still = all(start.placed for start in facts.plan.shown)
+        return f"{KEPT}: {why_not}" if still else f"{KEPT}, and what falls does not need it"
+
+    return skipped
 
 
 def _stored(part: Role | PixelKind) -> Reason:

@@ -278,6 +278,8 @@ def test_what_settles_falls_onto_what_is_kept_which_stays_and_both_have_the_cont
     over, kept, beside, can = scene["bodies"]
     assert kept["T_world_obj"] == held.ravel().tolist() and can["T_world_obj"][11] == aside[2, 3] + 0.4
     assert {"kept_poses", "dynamics", "object_contacts", "table_mesh"} <= set(scene["effects"])
+    (why,) = (each["why"] for each in scene["skipped"] if each["effect"] == "restitution")
+    assert why == "poses of scenes_from are kept, and what falls does not need it"
     assert abs(over["T_world_obj"][11] - held[2, 3] - height_m) < 1e-5
     assert abs(beside["T_world_obj"][11] - standing[2, 3]) < 1e-5
     assert {contact["with_region"] for contact in over["contacts"]} == {4}
