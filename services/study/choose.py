@@ -40,6 +40,10 @@ DEFAULT_TARGETS: Targets = {kind.name: kind.target for kind in ERRORS.values() i
 """The targets without a wish of the user: the accuracy that a dataset's labels promise."""
 
 
+ROUGH = 1.25
+"""Ends of an interval of time, one over the other, from which a setting that may save `WORTH` is measured in further scenes: of a
+dozen settings whose times vary by half from scene to scene, the cheapest in a few scenes is so by chance."""
+
 LEAST, FEWEST_RACING = 8, 4
 """Nothing is out, no part is decided and no combination is made before so many scenes; and so many settings are in every round,
 where even these do not fit in as many scenes as fit."""
@@ -83,14 +87,25 @@ def standings(table: Table, part: Part, targets: Targets) -> list[Standing]:
 
 
 def undecided(table: Table, part: Part, targets: Targets) -> list[Setting]:
-    """Settings that may turn out cheaper than the cheapest that surely meets the targets."""
+    """Settings that may turn out cheaper than the cheapest that surely meets the targets; the job, unless that saves `WORTH`."""
     left = standings(table, part, targets)
     best = min((some.ratio.value for some in left if some.ratio and some.verdict == "meets"), default=math.inf)
+
+    def may_win(some: Standing) -> bool:
+        if some.setting == OWN:
+            return best > 1.0 - WORTH
+        return some.ratio.low * AS_CHEAP < best if some.ratio else some.setting.kind != "several"
+
+    return [some.setting for some in left if some.verdict == "open" and may_win(some)]
+
+
+def roughly_timed(table: Table, part: Part, targets: Targets) -> list[Setting]:
+    """Settings that surely meet the targets and may save `WORTH`, of whose time little is known yet."""
+    met = [some for some in standings(table, part, targets) if some.verdict == "meets" and some.setting != OWN]
     return [
         some.setting
-        for some in left
-        if some.verdict == "open"
-        and (some.ratio.low * AS_CHEAP < best if some.ratio else some.setting.kind != "several")
+        for some in met
+        if some.ratio and some.ratio.low < 1.0 - WORTH and some.ratio.high > ROUGH * some.ratio.low
     ]
 
 
@@ -202,14 +217,18 @@ def choose(rows: Sequence[Row], targets: Targets, bounds: Targets | None = None)
 
     What a user asks for, without `bounds`, is met with bounds for scenes at large (`Figure.most`). Where no setting does, by
     values (`value <= target`) of settings whose bounds are nearest to the targets; of fewer than `FEWEST_SCENES` scenes of
-    the job itself by nothing. Default targets are met by values, and `bounds` are further targets that no message names.
+    the job itself by nothing. Default targets are met by values, and `bounds` are further targets that no message names; the
+    job itself misses them only where the whole interval of an error does, since a change within noise is none.
     """
     own = own_row(rows)
     if unknown := [name for name in targets if all(error_of(row, name, rows) is None for row in rows)]:
         known = ", ".join(sorted({error for row in rows for error in row.errors}))
         raise TargetError(f"--target {unknown[0]}: this study did not measure it. It measured {known}")
     limits = {**(bounds or {}), **targets}
-    able = [row for row in candidates(rows, targets) if excess(row, limits, rows, "value") == 0.0]
+    end = "value" if bounds is None else "low"
+    able = [
+        row for row in candidates(rows, targets) if excess(row, limits, rows, end if row is own else "value") == 0.0
+    ]
     if not able:
         raise TargetError(describe_miss(rows, targets))
     if bounds is not None:
@@ -326,7 +345,8 @@ def describe_answer(
     whole = f"{describe_seconds(chosen.ms * scenes / 1e3)}, {size(chosen.kilobytes * scenes)}"
     cost = f"{milliseconds(chosen.ms)} of processor a scene ({plural(scenes, 'scene')}: {whole})"
     unproved = " It is not proved: the budget left no time for fresh scenes." if asked and not proofs else ""
-    doubt = _doubt(chosen, targets or {}, rows)
+    missed = {name: most for name, most in asked.items() if name in own.errors and own.errors[name].value > most}
+    doubt = _doubt(chosen, (missed if chosen is own else {}) if targets is None else targets, rows)
     if few:
         doubt += f" Of {plural(len(few), 'setting')} fewer than {FEWEST_SCENES} scenes were measured: nothing is said of these."
     return f"For {wish}, {use}, which costs {cost}{saved}{loss}.{doubt}{unproved}", chosen.setting.name

@@ -224,6 +224,11 @@ def run_study(plan: Plan, journal: Journal, progress: ProgressLine, began: float
             doubts.append(
                 f"{PARTS[part].words}: whether these keep the targets is not sure to 95 %: {', '.join(names)}"
             )
+        if rough := choose.roughly_timed(table, part, bench.targets):
+            names = [f"{some.name} ({plural(len(table.answers(part, some)), 'scene')})" for some in rough]
+            doubts.append(
+                f"{PARTS[part].words}: how long these take is not known to a factor of {choose.ROUGH:g}: {', '.join(names)}"
+            )
     answer, chosen = choose.describe_answer(able, plan.targets, proofs, plan.job.scenes)
     return Study(
         job=plan.job.name,
@@ -282,7 +287,8 @@ def run_rounds(bench: Measurement) -> None:
     for level in LEVELS:
         table, share = bench.table(), PILOT_SHARE if level == 1 else RACE_SHARE
         parts = [part for part in bench.split.measured if level <= PARTS[part].scenes]
-        parts = [part for part in parts if level <= choose.LEAST or choose.undecided(table, part, bench.targets)]
+        tests = choose.undecided, choose.roughly_timed
+        parts = [part for part in parts if level <= choose.LEAST or any(f(table, part, bench.targets) for f in tests)]
         weights, wanted = sum(PARTS[part].share for part in parts), list[choose.Wanted]()
         for part in parts:
             part_s = bench.left_s(share) * bench.plan.processes / 2 * PARTS[part].share / weights

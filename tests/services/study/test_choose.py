@@ -102,6 +102,18 @@ def test_bounds_for_other_scenes_decide_and_where_none_meets_the_targets_the_nea
     assert answer(unproved, {"depth_mm": 0.1}).endswith("It is not proved: the budget left no time for fresh scenes.")
 
 
+def test_without_a_wish_the_job_stays_where_it_misses_a_default_target_within_its_interval_alone():
+    off, noisy, other = row(depth_mm=0.107), row(depth_mm=0.107), row("step=240", 0.99, depth_mm=0.02)
+    wide = dataclasses.replace(noisy.errors["depth_mm"], low=0.0004, most=0.18, scenes=11)
+    noisy = dataclasses.replace(noisy, errors={"depth_mm": wide})
+    off = dataclasses.replace(off, errors={"depth_mm": dataclasses.replace(wide, low=0.101)})
+    assert recommend([noisy, other], None) is noisy and recommend([off, other], None) is other
+    assert recommend([noisy, dataclasses.replace(other, ratio=0.9, ratio_most=0.93)], None).setting.name == "step=240"
+    assert recommend([noisy, other], {"depth_mm": 0.1}) is other  # who asks for it gets what meets it
+    doubt = "scenes that were not measured may have depth of objects up to 0.18 mm (from 11)."
+    assert "use the job as it is" in answer(study(noisy, other)) and doubt in answer(study(noisy, other))
+
+
 def test_a_setting_that_few_scenes_measured_is_not_recommended():
     for scenes, chosen in ((3, "the job"), (4, "step=60")):
         few = row("step=60", 0.5, scenes=scenes, depth_mm=0.01)
@@ -134,9 +146,9 @@ UNMET = (
         "The nearest is a=1, at 0.5 times the job's time: it misses flip, which is unknown instead of 0.2",
     ),
     (
-        [row(camera_mm=0.2, view_depth_mm=1.58)],
+        [row(camera_mm=0.2, view_depth_mm=1.7)],
         None,
-        "misses view_depth_mm, which is 1.58 mm instead of 1.5 mm. Set others",
+        "misses view_depth_mm, which is 1.7 mm instead of 1.5 mm. Set others",
     ),
     (
         [row(depth_mm=0.5, flip=0.1), row("tier=flat", 0.5, depth_mm=0.05, flip=0.9)],

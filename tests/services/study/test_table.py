@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from services.study.choose import LEAST, next_round, standings, undecided
+from services.study.choose import LEAST, next_round, roughly_timed, standings, undecided
 from services.study.model import OWN, REFERENCES, Figure, Setting
 from services.study.table import (
     LEAST_OUTCOMES,
@@ -203,6 +203,19 @@ def test_what_surely_misses_or_surely_costs_more_is_out_and_nothing_before_it_wa
         spread[unit_name("draw", n, FLAT)]["errors"] = {"depth_mm": 0.19 if n % 2 else 0.05}
     assert undecided(Table(PARTS, spread), "draw", LOOSE) == [FLAT]
     assert undecided(Table(PARTS, spread), "draw", {"pose_mm": 0.1}) == []  # what the job has not is not waited for
+
+
+def test_the_job_is_measured_until_it_surely_meets_a_target_and_what_may_save_time_until_its_time_is_known():
+    even, uneven, slower = journal(64), journal(16), journal(64, flat_s=1.0)
+    for n in range(16):
+        uneven[unit_name("draw", n, FLAT)]["s"] = 0.05 if n % 4 else 3.5
+    assert roughly_timed(Table(PARTS, even), "draw", LOOSE) == []
+    assert roughly_timed(Table(PARTS, uneven), "draw", LOOSE) == [FLAT]
+    for n in range(64):
+        even[unit_name("draw", n, OWN)]["errors"] = {"depth_mm": 0.25 if n == 7 else 0.1}
+        slower[unit_name("draw", n, OWN)]["errors"] = {"depth_mm": 0.25 if n in (7, 9) else 0.15}
+    assert OWN in undecided(Table(PARTS, slower), "draw", LOOSE)  # nothing saves time
+    assert OWN not in undecided(Table(PARTS, even), "draw", LOOSE)  # whether it meets them or not, another is cheaper
 
 
 def test_a_round_that_does_not_fit_keeps_the_promising_half_and_never_takes_more_than_allowed():
