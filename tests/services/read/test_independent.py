@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -516,12 +516,15 @@ def no_reaction(low, high):
 
 
 def test_forces_of_a_scene_in_balance_have_no_fault_and_each_wrong_one_is_told():
-    def faults(edit: Callable, job: dict = JOB) -> str:
+    def faults(edit: Callable, job: dict = JOB, effects: Sequence[str] = (), fallen: Collection[int] = ()) -> str:
         bodies = copy.deepcopy(BODIES)
         edit(*bodies)
-        return "; ".join(check_forces(job, {"scene_id": 7, "bodies": bodies, "effects": []}))
+        return "; ".join(check_forces(job, {"scene_id": 7, "bodies": bodies, "effects": effects}, fallen))
 
     assert faults(lambda low, high: None) == ""
+    assert faults(nothing_below, effects=["kept_poses"]) == ""  # what is kept may hang in the air
+    assert faults(nothing_below, effects=["kept_poses"], fallen={4}) == "scene 7, region 4: nothing holds it"
+    assert "presses region 4" in faults(no_reaction, effects=["kept_poses"])
     for edit, told in (
         (nothing_below, "region 4: nothing holds it"),
         (lambda low, high: high.update(mass_kg=1.02), "region 4: its contact forces leave 2.0% of its weight over"),
