@@ -10,7 +10,7 @@ from workers.scene.effects import EFFECTS, plan_effects
 
 TRACED_EFFECTS = ("global_illumination", "glass")
 
-OF_SECONDS = ("decomposition", "glass", "raycast_check")
+OF_SECONDS = ("decomposition", "glass", "raycast_check", "environment", "release_again", "global_illumination")
 """Effects whose scene takes two seconds, of which tier, label and fall others stand for by default."""
 
 

@@ -269,6 +269,7 @@ CHAOTIC = (
         threaded,
         again=False,
         tier="slow",
+        first="minute",
         refused="unsupported",
     ),
     # Moved by at most 10 micrometres and 0.002 degrees, as the table of margins does: these alone end in several ways.

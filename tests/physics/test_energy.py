@@ -72,6 +72,7 @@ GROUPS = {
 }
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("make", GROUPS.values(), ids=GROUPS)
 def test_the_energy_of_all_that_falls_together_never_rises_above_its_running_minimum(make, request, record_figure):
     group = make()

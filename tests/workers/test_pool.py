@@ -170,6 +170,7 @@ def test_a_caller_that_stops_half_way_leaves_no_process():
     assert pids and not any(Path(f"/proc/{pid}").exists() for pid in pids)
 
 
+@pytest.mark.minute
 def test_children_end_with_a_killed_asker(tmp_path):
     script = tmp_path / "ask.py"
     script.write_text(

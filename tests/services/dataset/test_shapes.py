@@ -51,6 +51,7 @@ def test_a_welded_mesh_is_watertight_where_the_asset_is_and_is_the_same_surface(
     assert trimesh.proximity.closest_point(seen, seen.triangles_center[:5])[1].max() < 1e-9  # which asks rtree
 
 
+@pytest.mark.minute
 def test_colours_of_vertices_are_shown_by_a_mesh_and_by_a_stored_file_read_as_the_page_says(
     tmp_path,
 ):

@@ -39,6 +39,7 @@ def pictures_of(folder):
     return [picture for split in SPLITS if (folder / split).is_dir() for picture in load_pictures(folder, split)]
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("name", ["shaped", "heap"])
 def test_coordinates_and_depth_give_the_pose_and_the_size_of_every_object(name, nocs):
     """What their evaluation does: the similarity from coordinates to back-projected depth is pose and diagonal."""

@@ -170,6 +170,7 @@ def contents(out: Path) -> dict[str, bytes]:
     return {path: (out / path).read_bytes() for paths in files_by_kind(out).values() for path in paths}
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("layout", ["tiny", "packed"])
 def test_every_fault_goes_by_its_remedy_and_the_dataset_is_the_same(layout, request, tmp_path):
     """The first file of each kind missing, the last damaged, all at once; then what `verify` says is done."""

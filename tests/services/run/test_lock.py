@@ -182,6 +182,7 @@ def test_a_holder_that_was_paused_is_told_who_took_over_and_leaves_the_new_lock_
     assert read_holder(store) == THEIRS
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("ended", [False, True], ids=["still there", "ended again"])
 def test_paused_at_any_step_of_a_beat_and_taken_over_a_holder_knows_that_it_lost(ended, tmp_path):
     at, lost = 0, 0

@@ -95,6 +95,7 @@ CASES = {
 QUICK = ("noise", "bias", "print, by depth")
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.minute) for name in CASES]
 )
@@ -201,6 +202,7 @@ def test_a_view_that_does_not_fit_is_flagged_and_takes_no_part(capture):
 # ---------------------------------------------------------------------------------------------- what a camera does to edges
 
 
+@pytest.mark.minute
 def test_squares_that_all_look_larger_do_not_bring_the_cameras_nearer():
     """Ink that spreads by 0.3 mm, by OpenCV's projection of a board of larger squares."""
     printed = marker_corners(Board(marker_m=0.0603, gap_m=0.0197))

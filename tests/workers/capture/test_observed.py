@@ -150,6 +150,7 @@ def test_the_covariance_tells_the_errors():
     assert 2.2 < np.mean(squares) < 4.0  # chi-square of three
 
 
+@pytest.mark.minute
 def test_one_small_marker_is_ambiguous_and_a_whole_board_is_not():
     rng, one, whole = np.random.default_rng(2), [], []
     for T in hand_held(rng, 30, distance_m=(2.5, 2.5)):

@@ -387,6 +387,7 @@ def test_a_mask_of_the_user_is_kept_and_a_view_without_a_pose_or_a_capture_witho
 # ---------------------------------------------------------------------------------------------- the processed folder
 
 
+@pytest.mark.minute
 def test_each_photograph_is_decoded_once_and_again_only_for_a_mask_of_the_user(tmp_path, monkeypatch):
     path, read = copy_of(box(), tmp_path), []
     shutil.copy(path / "truth" / "mask_00002.png", path / "mask_00002.png")

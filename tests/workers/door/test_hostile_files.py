@@ -401,6 +401,7 @@ def read_mutants(folder: Path, indices: range) -> Counter[str]:
     return found
 
 
+@pytest.mark.minute
 def test_some_mutants_are_read_or_refused_and_nothing_else(tmp_path):
     assert {"read", "unreadable"} < set(read_mutants(tmp_path, range(30)))
 

@@ -343,6 +343,7 @@ def test_what_finds_no_balance_is_removed_where_what_leaves_is(monkeypatch):
         settle_scene(scene_of(starts, TABLE), PHYSICS, EffectPlan(ALL, {}))
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("pouring", first_of([NOTHING_MORE, Pouring(remove=True)], 1))
 @pytest.mark.parametrize("push_m_s", [(40.0, 0.0, 0.0), (0.0, 0.0, 10.0)])
 def test_what_was_thrown_is_told_so_and_never_rests_nor_counts_as_lost(push_m_s, pouring, monkeypatch):

@@ -92,6 +92,7 @@ def test_light_of_a_studio_shows_the_shape_of_a_white_ball_and_draws_no_line_alo
             assert across.max() < 1.15 * across[len(across) // 2]
 
 
+@pytest.mark.minute
 @pytest.mark.parametrize("level_m", [0.0, 0.6], ids=["on the floor", "on a table"])
 def test_a_boxs_shadow_ends_where_geometry_says_and_without_it_the_place_has_lamberts_brightness(renderer, level_m):
     """A box 0.2 high throws a shadow 0.2 / tan of the light's elevation long: its end, within 2 px of the image.
