@@ -202,7 +202,9 @@ def recommend(rows: Sequence[Row], targets: Targets | None) -> Row:
     single = [row for row in rows if row.setting.kind == "single"]
     telling = {row.setting.knob for row in single if set(row.errors) - {"failed_share"}}
     blind = {row.setting.knob for row in single} - telling  # knobs without any measured error: their loss is unknown
-    return choose([row for row in rows if not set(dict(row.setting.parts)) & blind], asked, bounds)
+    most_kb = AS_CHEAP * own_row(rows).kilobytes  # who asks for nothing keeps the disk space too
+    kept = [row for row in rows if not set(dict(row.setting.parts)) & blind and row.kilobytes <= most_kb]
+    return choose(kept, asked, bounds)
 
 
 def default_targets(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:

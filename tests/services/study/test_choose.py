@@ -110,6 +110,8 @@ def test_without_a_wish_the_job_stays_where_it_misses_a_default_target_within_it
     assert recommend([noisy, other], None) is noisy and recommend([off, other], None) is other
     assert recommend([noisy, dataclasses.replace(other, ratio=0.9, ratio_most=0.93)], None).setting.name == "step=240"
     assert recommend([noisy, other], {"depth_mm": 0.1}) is other  # who asks for it gets what meets it
+    large = dataclasses.replace(row("png_level=0", 0.8, depth_mm=0.02), kilobytes=5.0 * noisy.kilobytes)
+    assert recommend([noisy, large], None) is noisy  # time is not saved at the price of five times the disk
     doubt = "scenes that were not measured may have depth of objects up to 0.18 mm (from 11)."
     assert "use the job as it is" in answer(study(noisy, other)) and doubt in answer(study(noisy, other))
 
