@@ -314,7 +314,9 @@ def test_overlap_and_hover_are_distances_of_the_true_bodies(name):
     """Of cubes over a table of 0.7 m: (asset, x, height of its underside over the table, metres), and (hover, overlap) in mm."""
     things, figures = KEPT[name]
     poses = [pose(np.eye(3), np.array([x, 0.0, 0.7 + z_m + asset.extents_m[2] / 2])) for asset, x, z_m in things]
-    starts = [start_at(asset, T, 3 + n) for n, ((asset, _, _), T) in enumerate(zip(things, poses, strict=True))]
+    starts = [
+        start_at(asset, T, 3 + n, placed=True) for n, ((asset, _, _), T) in enumerate(zip(things, poses, strict=True))
+    ]
     if isinstance(figures, str):
         with pytest.raises(SettleError, match=re.escape(figures)):
             keep_scene(scene_of(starts, ON), PHYSICS, EffectPlan((), {}), 1.0)
