@@ -198,6 +198,13 @@ class Measurement:
             self.progress.show(round(self.spent_s))
 
 
+OPEN = {
+    choose.undecided: "whether these keep the targets is not sure to 95 %",
+    choose.roughly_timed: f"how long these take is not known to a factor of {choose.ROUGH:g}",
+}
+"""What settings of a part are measured further for, and what is told where the budget ends before."""
+
+
 def run_study(plan: Plan, journal: Journal, progress: ProgressLine, began: float, **about: Any) -> Study:
     """Measures until the answer is sure or the budget is spent, proves the answer, and puts it in words.
 
@@ -219,16 +226,10 @@ def run_study(plan: Plan, journal: Journal, progress: ProgressLine, began: float
     if late := [setting.name for setting in plan.settings if table.row(setting) is None]:
         notes.append(f"not reached within the budget: {', '.join(late)}")
     for part in bench.split.measured:
-        if rivals := choose.undecided(table, part, bench.targets):
-            names = [f"{some.name} ({plural(len(table.answers(part, some)), 'scene')})" for some in rivals]
-            doubts.append(
-                f"{PARTS[part].words}: whether these keep the targets is not sure to 95 %: {', '.join(names)}"
-            )
-        if rough := choose.roughly_timed(table, part, bench.targets):
-            names = [f"{some.name} ({plural(len(table.answers(part, some)), 'scene')})" for some in rough]
-            doubts.append(
-                f"{PARTS[part].words}: how long these take is not known to a factor of {choose.ROUGH:g}: {', '.join(names)}"
-            )
+        for test, what in OPEN.items():
+            if rivals := test(table, part, bench.targets):
+                names = [f"{some.name} ({plural(len(table.answers(part, some)), 'scene')})" for some in rivals]
+                doubts.append(f"{PARTS[part].words}: {what}: {', '.join(names)}")
     answer, chosen = choose.describe_answer(able, plan.targets, proofs, plan.job.scenes)
     return Study(
         job=plan.job.name,
@@ -287,8 +288,7 @@ def run_rounds(bench: Measurement) -> None:
     for level in LEVELS:
         table, share = bench.table(), PILOT_SHARE if level == 1 else RACE_SHARE
         parts = [part for part in bench.split.measured if level <= PARTS[part].scenes]
-        tests = choose.undecided, choose.roughly_timed
-        parts = [part for part in parts if level <= choose.LEAST or any(f(table, part, bench.targets) for f in tests)]
+        parts = [part for part in parts if level <= choose.LEAST or any(f(table, part, bench.targets) for f in OPEN)]
         weights, wanted = sum(PARTS[part].share for part in parts), list[choose.Wanted]()
         for part in parts:
             part_s = bench.left_s(share) * bench.plan.processes / 2 * PARTS[part].share / weights

@@ -11,6 +11,7 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.base import Pose, frozen_array
 from schemas.errors import SettleError
@@ -333,7 +334,7 @@ def _settle_alone(
             continue
         began += starts
         settled += rests
-    return renumbered(began), tuple(settled)
+    return renumbered(began) if len(began) < len(plan.objects) else tuple(began), tuple(settled)
 
 
 def keep_scene(plan: ScenePlan, physics: Physics, effects: EffectPlan, most_mm: float) -> Rest:
@@ -378,32 +379,32 @@ def _fall_over(
     called = called_for(falling, table, physics)
     over = dataclasses.replace(plan, objects=tuple(falling), ground=dataclasses.replace(ground, table=table))
     fallen = settle_scene(over, physics, add_effects(effects, called))
-    own = [dataclasses.replace(b, region_id=a.region_id) for a, b in zip(falling, fallen.starts, strict=True)]
-    fallen = dataclasses.replace(fallen, starts=tuple(own))
     late = dict.fromkeys(sorted(called), "not all poses are kept") | dict(fallen.called)
-    return _with_contacts(rest, fallen, meshes, {**rest.called, **late})
+    ends = np.cumsum([len(mesh.faces) for mesh in meshes])
+    return _with_contacts(rest, fallen, table.mesh, ends, {**rest.called, **late})
 
 
-def _with_contacts(rest: Rest, fallen: Rest, meshes: Sequence[Mesh], called: Mapping[str, str]) -> Rest:
+def _with_contacts(rest: Rest, fallen: Rest, below: Mesh, ends: NDArray[np.int64], called: Mapping[str, str]) -> Rest:
     """Both, in order of region: contacts with one body of the table and of what lies still are those with the nearest of these.
 
-    meshes: of the table, and of what lies still, world. What is not clutter is pressed in return by what fell on it.
+    below: the table and what lies still, world, of which `ends` [bodies] count the faces up to each one's last. What lies still
+    has the contacts with what fell on it too, but for clutter.
     """
-    settled, joined, ends = list(rest.settled), join_meshes(meshes), np.cumsum([len(mesh.faces) for mesh in meshes])
+    settled = list(rest.settled)
     for start, each in zip(fallen.starts, fallen.settled, strict=True):
-        _, faces = distance_to_mesh(np.reshape([one.point for one in each.contacts], (-1, 3)), joined)
+        _, faces = distance_to_mesh(np.reshape([one.point for one in each.contacts], (-1, 3)), below)
         contacts = list(each.contacts)
         for number, (contact, part) in enumerate(
             zip(each.contacts, np.searchsorted(ends, faces, "right"), strict=True)
         ):
             if contact.with_region != REGION_TABLE or part == 0:
                 continue
-            below, point = settled[part - 1], contact.point
+            under, point = settled[part - 1], contact.point
             contacts[number] = dataclasses.replace(contact, with_region=rest.starts[part - 1].region_id)
             if not start.is_clutter:
                 normal, force = frozen_array(-contact.normal), frozen_array(-contact.force)
-                pressed = (*below.contacts, ContactForce(start.region_id, point, normal, force))
-                settled[part - 1] = dataclasses.replace(below, contacts=pressed)
+                pressed = (*under.contacts, ContactForce(start.region_id, point, normal, force))
+                settled[part - 1] = dataclasses.replace(under, contacts=pressed)
         settled.append(dataclasses.replace(each, contacts=tuple(contacts)))
     starts = (*rest.starts, *fallen.starts)
     order = sorted(range(len(starts)), key=lambda number: starts[number].region_id)
