@@ -72,8 +72,7 @@ OTHERS = {
 }
 
 
-@pytest.mark.minute
-@pytest.mark.parametrize("name", first_of(OTHERS, 1, 3))
+@pytest.mark.parametrize("name", first_of(OTHERS, 0, 3))
 def test_a_board_that_is_not_board_jsons_is_named_and_the_command_that_is_printed_makes_the_capture_right(
     name, tmp_path
 ):
@@ -111,8 +110,7 @@ SECONDS = {
 }
 
 
-@pytest.mark.minute
-@pytest.mark.parametrize("name", first_of(SECONDS, 1, 2))
+@pytest.mark.parametrize("name", first_of(SECONDS, 0, 2))
 def test_of_two_prints_in_view_the_one_that_the_object_stands_on_is_the_board(name, tmp_path):
     poses = photographed(tmp_path, Board(), views=6, beside=SECONDS[name])
     made = process_folder(tmp_path, Captures(estimation=Estimation(compare=True)))
@@ -154,8 +152,7 @@ HANDS = {
 }
 
 
-@pytest.mark.minute
-@pytest.mark.parametrize("name", first_of(HANDS, 1, 2))
+@pytest.mark.parametrize("name", first_of(HANDS, 0, 2))
 def test_a_hand_over_the_board_is_no_object_that_moved_and_in_no_cloud_or_mask(name, tmp_path):
     def beside(n):
         return [arm(*one) for one in HANDS[name].get(n, ())]

@@ -18,7 +18,6 @@ from tests.hard_cases.groups import place as at
 from tests.hard_cases.groups import put, together, tray
 from tests.hard_cases.hollow_cases import cups
 from tests.kit.shapes import asset_of, box
-from tests.kit.tiers import first_of
 from tests.physics.settling import (
     PHYSICS,
     effects_of,
@@ -344,7 +343,7 @@ def test_what_finds_no_balance_is_removed_where_what_leaves_is(monkeypatch):
 
 
 @pytest.mark.minute
-@pytest.mark.parametrize("pouring", first_of([NOTHING_MORE, Pouring(remove=True)], 1))
+@pytest.mark.parametrize("pouring", [NOTHING_MORE, Pouring(remove=True)])
 @pytest.mark.parametrize("push_m_s", [(40.0, 0.0, 0.0), (0.0, 0.0, 10.0)])
 def test_what_was_thrown_is_told_so_and_never_rests_nor_counts_as_lost(push_m_s, pouring, monkeypatch):
     """Whatever throws the second of two, here a push as its fall begins; upwards it comes down on the table again."""
