@@ -45,9 +45,12 @@ class EnergyRecord:
         self._least = min(self._least, self._last)
         self._most = max(self._most, self._last - self._least)
 
-    def rise(self) -> float:
-        """The most that the energy rose above its least until then, as a share of the bound."""
-        return self._most / max(SHARE * (self._first - self._last), LIFT_M)
+    def rise(self, end_m: float | None = None) -> float:
+        """The most that the energy rose above its least until then, as a share of the bound.
+
+        end_m: energy that the fall ends with, if it is not the last until then.
+        """
+        return self._most / max(SHARE * (self._first - (self._last if end_m is None else end_m)), LIFT_M)
 
     def _height_m(self, at: Sequence[BodyPose], moving: Sequence[Velocity]) -> float:
         """The height at which their centre of mass has as much at rest."""
@@ -160,7 +163,8 @@ class Watch:
 
     stops: conditions by name, of which one ends it. leaves: what holds of an object that is put away, while the others go on.
     standing: ends the fall of a single object sooner. sleeping: what rests costs no time until something that moves touches it.
-    apart: pairs of bodies that cannot meet before it ends, which cost no time.
+    apart: pairs of bodies that cannot meet before it ends, which cost no time. most_rise: rise of energy from which the fall is for
+    nothing: it ends, by `rise`, once the rise will be as much even if all bodies end at the height `lowest_m`, world z.
     """
 
     stops: Mapping[str, StopCondition] = field(default_factory=dict)
@@ -168,6 +172,8 @@ class Watch:
     standing: StandingCondition | None = None
     sleeping: bool = False
     apart: Sequence[tuple[int, int]] = ()
+    most_rise: float = math.inf
+    lowest_m: float = -math.inf
 
 
 def fall(
@@ -265,6 +271,8 @@ class _Simulation:
                 self._find_thrown()
                 self._put_away()
             self.speeds = _speeds(self.bodies, self.moving)
+            if self.energy.rise(self.watch.lowest_m) >= self.watch.most_rise:
+                return self._outcome(max(self.speeds), False, "rise")
             for name, stop in self.watch.stops.items():
                 if any(stop(number, pose) for number, pose in enumerate(self.at)):
                     return self._outcome(max(self.speeds), False, name)
@@ -353,7 +361,7 @@ class _Simulation:
 
     def _outcome(self, speed_m_s: float, rested: bool, name: str | None = None, face: Face | None = None) -> Outcome:
         # What others stop begins anew, or is let go again where it stops
-        rise = self.energy.rise() if name in (None, "below") else 0.0
+        rise = self.energy.rise() if name in (None, "below", "rise") else 0.0
         away = tuple(self.lost), frozenset(self.thrown), self.thrown_m_s
         return Outcome(tuple(map(as_pose, self.at)), speed_m_s, self.time, rested, name, rise, face, *away)
 

@@ -186,24 +186,25 @@ class Drop:
         return (PACES_POURED,) if self.poured else (PACES_MANY[:1], PACES_MANY[1:])
 
 
-def release(drop: Drop, flat: bool, paces: Sequence[Pace]) -> Outcome:
+def release(drop: Drop, flat: bool, paces: Sequence[Pace]) -> tuple[Outcome, Pace]:
     """Release the objects where they start, onto the table's flat top or its mesh, until they rest or must be stopped.
 
-    Stopped by `edge` where a footprint may leave the flat top, `below` where an object falls below the mesh, or among many
+    Returns the end and its pace. Stopped by `edge` where a footprint may leave the flat top, `below` where an object falls below the mesh, or among many
     below the top, and `room` where a single object leaves its room. Released again at the next pace where their energy rose,
     where one flew off, and where several did not rest.
     """
-    for pace in paces:
-        outcome = _release(drop, flat, pace, LOOK_STEPS if drop.single else SAMPLE_STEPS)
-        if drop.single and pace != paces[-1] and DOUBTFUL_RISE <= outcome.rise < KNOWN_RISE:
-            outcome = _release(drop, flat, pace, 1)
-        slow_enough = outcome.rise < (KNOWN_RISE if drop.single else MOST_RISE) and not outcome.thrown
+    most_rise = KNOWN_RISE if drop.single else MOST_RISE
+    for pace in paces[:-1]:
+        outcome = _release(drop, flat, pace, LOOK_STEPS if drop.single else SAMPLE_STEPS, most_rise)
+        if drop.single and DOUBTFUL_RISE <= outcome.rise < KNOWN_RISE:
+            outcome = _release(drop, flat, pace, 1, most_rise)
+        slow_enough = outcome.rise < most_rise and not outcome.thrown
         if slow_enough and (drop.single or outcome.rested or outcome.stopped_by):
-            break
-    return outcome
+            return outcome, pace
+    return _release(drop, flat, paces[-1], LOOK_STEPS if drop.single else SAMPLE_STEPS, math.inf), paces[-1]
 
 
-def _release(drop: Drop, flat: bool, pace: Pace, looked: int) -> Outcome:
+def _release(drop: Drop, flat: bool, pace: Pace, looked: int, most_rise: float) -> Outcome:
     table, effects, physics = drop.table, drop.effects, settings_of(drop, pace)
     starts = [choose_collision_shape(start, physics) for start in drop.starts]
     poses = [start.T_world_obj for start in starts]
@@ -235,7 +236,10 @@ def _release(drop: Drop, flat: bool, pace: Pace, looked: int) -> Outcome:
         ground = _parts_of_vessel(table)
     if math.isfinite(drop.room_m):
         stops["room"] = strays((poses[0] @ bodies[0].T_obj_body)[None, :2, 3], drop.room_m)
-    watch = Watch(stops, below if goes_on else None, standing, sleeping=drop.many)
+    # What is on the slab of the flat top is above it, but for what it sinks in
+    least_m = (table.top.height_m if isinstance(ground, float) else lowest_m) - reach_m
+    leaves = below if goes_on else None
+    watch = Watch(stops, leaves, standing, sleeping=drop.many, most_rise=most_rise, lowest_m=least_m)
     return fall(bodies, poses, ground, physics, steps, free_m, watch)
 
 

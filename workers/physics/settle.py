@@ -144,11 +144,15 @@ def _without_lost(drop: Drop, lost: LostError, again: dict[int, int]) -> Drop:
 def _settle_in_ways(drop: Drop, forms: Sequence[Form]) -> tuple[Settled, ...]:
     """Settle at the first of the drop's paces at which what comes to rest is accepted."""
     drop = _on_top_or_mesh(drop, _pour)
-    *earlier, last = (partial(_come_to_rest, forms=forms, paces=paces) for paces in drop.ways)
-    for way in earlier:
-        with suppress(UnsupportedError):
-            return describe(_on_top_or_mesh(drop, way))
-    return describe(_on_top_or_mesh(drop, last))
+    *earlier, last = drop.ways
+    for paces in earlier:
+        used = set[Pace]()
+        try:
+            return describe(_on_top_or_mesh(drop, partial(_come_to_rest, forms=forms, paces=paces, used=used)))
+        except UnsupportedError:
+            if used <= set(last):  # the last way would be the same once more
+                raise
+    return describe(_on_top_or_mesh(drop, partial(_come_to_rest, forms=forms, paces=last)))
 
 
 Result = TypeVar("Result")
@@ -169,8 +173,10 @@ def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
     return dataclasses.replace(effects, ran=(*effects.ran, *names))
 
 
-def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence[Pace]) -> Ending:
-    """Release at these paces until at rest.
+def _come_to_rest(
+    drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence[Pace], used: set[Pace] | None = None
+) -> Ending:
+    """Release at these paces until at rest, and add to `used` those that a release ended at.
 
     The simulation may end with objects that rolling friction or a shape's margin holds out of balance. They are followed
     as they tip or slip, and released again where that takes them far. Raises LeftTopError, LeftRoomError and SettleError.
@@ -178,10 +184,10 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
     exact, heaped, seconds = drop.physics.exact_rest, bool(drop.lying), drop.seconds
     if exact and (landed := land(drop, flat, forms)) is not None:
         return Ending(drop, *landed)
-    placement, moved = None, 0
+    placement, moved, used = None, 0, set[Pace]() if used is None else used
     most = POURED_RELEASES if heaped else MOST_RELEASES
     for _ in range(most):
-        outcome = _release(_briefly(drop, POURED_S) if heaped and exact else drop, flat, paces)
+        outcome = _release(_briefly(drop, POURED_S) if heaped and exact else drop, flat, paces, used)
         seconds += outcome.seconds
         require_calm(drop, outcome, range(len(drop.starts)), moving=heaped and exact)
         if exact and flat and drop.single and (standing := _stand(drop, outcome, seconds)) is not None:
@@ -207,8 +213,9 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
     )
 
 
-def _release(drop: Drop, flat: bool, paces: Sequence[Pace]) -> Outcome:
-    outcome = release(drop, flat, paces)
+def _release(drop: Drop, flat: bool, paces: Sequence[Pace], used: set[Pace]) -> Outcome:
+    outcome, pace = release(drop, flat, paces)
+    used.add(pace)
     if outcome.stopped_by == "room":
         raise LeftRoomError
     if outcome.stopped_by == "edge":
@@ -223,7 +230,7 @@ def _pour(drop: Drop, flat: bool) -> Drop:
         if len(falling) == len(drop.starts):
             break
         few = dataclasses.replace(drop, starts=tuple(drop.starts[number] for number in falling))
-        outcome = _release(_briefly(few, WAVE_S), flat, drop.ways[0][:1])
+        outcome = _release(_briefly(few, WAVE_S), flat, drop.ways[0][:1], set())
         poses = [start.T_world_obj for start in drop.starts]
         for number, T in zip(falling, outcome.poses, strict=True):
             poses[number] = T
