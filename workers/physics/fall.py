@@ -163,8 +163,8 @@ class Watch:
 
     stops: conditions by name, of which one ends it. leaves: what holds of an object that is put away, while the others go on.
     standing: ends the fall of a single object sooner. sleeping: what rests costs no time until something that moves touches it.
-    apart: pairs of bodies that cannot meet before it ends, which cost no time. most_rise: rise of energy from which the fall is for
-    nothing: it ends, by `rise`, once the rise will be as much even if all bodies end at the height `lowest_m`, world z.
+    apart: pairs of bodies that cannot meet before it ends, which cost no time. most_rise: rise of energy from which the fall is
+    discarded: it ends, by `rise`, once it is sure to rise by as much, even if all bodies end at the height `lowest_m`, world z.
     """
 
     stops: Mapping[str, StopCondition] = field(default_factory=dict)

@@ -189,9 +189,9 @@ class Drop:
 def release(drop: Drop, flat: bool, paces: Sequence[Pace]) -> tuple[Outcome, Pace]:
     """Release the objects where they start, onto the table's flat top or its mesh, until they rest or must be stopped.
 
-    Returns the end and its pace. Stopped by `edge` where a footprint may leave the flat top, `below` where an object falls below the mesh, or among many
-    below the top, and `room` where a single object leaves its room. Released again at the next pace where their energy rose,
-    where one flew off, and where several did not rest.
+    Returns the end and its pace. Stopped by `edge` where a footprint may leave the flat top, `below` where an object falls
+    below the mesh, or among many below the top, and `room` where a single object leaves its room. Released again at the next
+    pace where their energy rose, where one flew off, and where several did not rest.
     """
     most_rise = KNOWN_RISE if drop.single else MOST_RISE
     for pace in paces[:-1]:

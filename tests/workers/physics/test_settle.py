@@ -49,7 +49,7 @@ from workers.physics.release import (
     Drop,
     release,
 )
-from workers.physics.settle import LEFT_ROOM, LEFT_TOP, RECHECK_S, Rest, settle_scene
+from workers.physics.settle import LEFT_ROOM, LEFT_TOP, MOST_RELEASES, RECHECK_S, Rest, settle_scene
 
 TABLE = level()
 TOP = TABLE.top.height_m
@@ -224,6 +224,22 @@ def test_what_gains_energy_falls_again_in_shorter_steps_until_it_gains_none(monk
         (mugs, [1.01 * MOST_RISE] * 9, [(PACES_MANY[0].rate, SAMPLE_STEPS)]),
     ):
         assert falls_of(starts, rises) == expected, (len(starts), rises)
+
+
+def test_no_way_is_fallen_again_that_would_be_the_same_once_more(monkeypatch):
+    """Two cubes that never stay: the last way falls at the last pace, as the first has where energy always rose at the other."""
+    monkeypatch.setattr(settle, "hold", lambda _drop, _placement, poses: Rested(tuple(poses), False, 0, balanced=True))
+    starts = [at(CUBE, TABLE, (x, 0, 0.031), LEANS) for x in (-0.2, 0.2)]
+    coarse, fine = (pace.rate * PHYSICS.step_hz for pace in PACES_TOGETHER)
+    for rise, expected in (
+        (1.0, [coarse, fine] * MOST_RELEASES),
+        (0.0, [coarse] * MOST_RELEASES + [fine] * MOST_RELEASES),
+    ):
+        with monkeypatch.context() as patch:
+            seen = told_by(patch, lambda outcome, rise=rise: dataclasses.replace(outcome, rise=rise))
+            with pytest.raises(SettleError, match="tips or slips on without end"):
+                group_of(starts)
+        assert [steps.base_hz for steps, _ in seen] == expected
 
 
 # ---------------------------------------------------------------------------------------------- let go again

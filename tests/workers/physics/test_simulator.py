@@ -21,7 +21,14 @@ from tests.hard_cases.drops import level
 from tests.kit.shapes import asset_of, box
 from tests.physics.room import at, ball_body, drop
 from tests.physics.settling import start_at
-from workers.geometry.frames import pose, quaternion_from_rotation, transform, translation, uniform_rotation
+from workers.geometry.frames import (
+    pose,
+    quaternion_from_rotation,
+    rotation_about,
+    transform,
+    translation,
+    uniform_rotation,
+)
 from workers.geometry.hull import convex_hull, depth_m
 from workers.physics import bullet, rigid_body
 from workers.physics.bullet import DECIMALS, GRAVITY_M_S2, STDERR, obj_of, open_world, silence_stderr
@@ -31,6 +38,7 @@ from workers.physics.fall import (
     SHARE,
     SKIPPED_TO_M,
     EnergyRecord,
+    Outcome,
     StepSizes,
     Watch,
     fall,
@@ -253,6 +261,23 @@ def test_a_rise_is_measured_from_the_least_so_far_and_against_all_that_was_set_f
     for height in heights:
         record.add(height, moving)
     assert record.rise() == pytest.approx(4e-4 / (SHARE * 1.0))
+
+
+def test_a_fall_ends_once_its_rise_is_sure_and_any_other_as_if_nobody_had_looked():
+    """A box that lands on a corner in steps of 17 ms gains energy, whatever it may still set free down to -0.01 m."""
+    T = pose(rotation_about(np.array([0.8, 0.6, 0.0]), 0.7), np.array([0.0, 0.0, 0.3]))
+    body, coarse = body_of(trimesh.creation.box((0.1, 0.08, 0.2))), PHYSICS.model_copy(update={"step_hz": 60})
+
+    def ended(most_rise: float) -> Outcome:
+        watch = Watch(most_rise=most_rise, lowest_m=-0.01)
+        return fall([body], [T], 0.0, coarse, StepSizes(60, math.inf), 0.0, watch)
+
+    whole = ended(math.inf)
+    assert whole.rise > 1.0 and whole.stopped_by is None
+    sooner = ended(whole.rise / 2.0)
+    assert sooner.stopped_by == "rise" and sooner.rise >= whole.rise / 2.0 and sooner.seconds < whole.seconds
+    other = ended(whole.rise * 1.001)
+    assert other.seconds == whole.seconds and other.poses[0].tobytes() == whole.poses[0].tobytes()
 
 
 # ---------------------------------------------------------------------------------------------- fall
