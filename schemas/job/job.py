@@ -332,8 +332,6 @@ class Job(Frozen):
 
 def _unfit_for_scene(job: Job) -> str | None:
     """The key that the job's kind of scene cannot have, with the remedy; None where all fit."""
-    if job.scenes_from is not None and job.scene != "tabletop":
-        return f"scene is {job.scene}, and scenes_from puts objects on a table: leave one of them out"
     if job.scene == "tabletop":
         if job.start.pose == "as_given":
             return "start.pose is as_given, and on a table an object may not rest so: use upright, tumbled or placed"

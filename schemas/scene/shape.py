@@ -52,7 +52,7 @@ class Material:
     alone; `transmission_map` [h, w] uint8 multiplies it, and `ior` is the index of refraction. A transmitting surface is a
     thin sheet; an `ior` of 1 lets all light pass, for the second side of a wall whose first side stands for both.
     `emission` is light that the surface sends, its colour times this, where white in full light sends 1; tiers without paths draw
-    a surface that mirrors so much more of what arrives, and the path tracer leaves it out.
+    a surface that mirrors so much more of what arrives. The path tracer makes a lamp of it, which must be the pane of a window.
     `jpeg` is the file that the texture was read from, if it was a JPEG of the same pixels: a copy as PNG has five times its size.
     """
 

@@ -298,7 +298,7 @@ def describe_dataset(record: JobRecord, catalogue: "Catalogue", merged: MergeRes
 |---|---|
 | scenes | {job.first_scene} to {job.stop_scene - 1}: {counts} |
 | pairs in each scene | {"at most " * captured}{job.pairs_per_scene} |
-| objects in each scene | {"as scenes_from has them" if job.scenes_from else objects_in_each} |
+| objects in each scene | {"as scenes_from has them" if job.scenes_from and not alone else objects_in_each} |
 | views of each pair | {", ".join(stored_roles(job))}{"" if job.render.rgb else "; without RGB"} |
 {more}| seed | {job.seed} |
 | dataset digest | `{merged.digest}` |

@@ -76,6 +76,8 @@ class GivenScene:
     objects: tuple[GivenObject, ...]
     table_id: str | None
     cameras: tuple[tuple[Pose, Intrinsics | None], ...]
+    alone: bool
+    """Whether it is of a studio dataset, whose object stands on nothing."""
 
 
 class _Kind(NamedTuple):
@@ -133,7 +135,8 @@ def read_scene(file: PoseFile, scene_id: int) -> GivenScene:
         raise StartError("bad_row", f"{where} has the tables {', '.join(tables)}: give one")
     if not 0 < len(objects) <= MOST_OBJECTS:
         raise StartError("bad_row", f"{where} has {len(objects)} objects, and must have 1 to {MOST_OBJECTS}")
-    return GivenScene(tuple(objects.values()), tables[0] if tables else None, tuple(cameras.values()))
+    alone = any(row.get("alone") for row in rows)
+    return GivenScene(tuple(objects.values()), tables[0] if tables else None, tuple(cameras.values()), alone)
 
 
 def _kind_of(path: Path) -> _Kind:
@@ -253,15 +256,18 @@ def _dataset_rows(file: PoseFile, scene_id: int) -> list[Row]:
     for failure in _rows(file, "failures", ("reason", "detail"), scene_id):
         raise StartError("failed_before", f"it failed in {file.path} ({failure['reason']}): {failure['detail']}")
     scenes = _rows(file, "scenes", ("table_id", "bodies"), scene_id)
-    if any(scene["table_id"] is None or not scene["bodies"] for scene in scenes):
-        raise StartError(
-            "no_table", f"{file.path} has captures, or scenes of a studio: take a dataset of scenes on a table"
-        )
+    if not all(scene["bodies"] for scene in scenes):
+        raise StartError("no_table", f"{file.path} has captures: take a dataset of scenes")
     shapes = _shapes_near(file, scene_id // TOGETHER * TOGETHER)
     views = _rows(file, "views", ("role", "pose_id", *_CAMERA), scene_id)
     inputs = sorted((view for view in views if view["role"] == "input"), key=lambda view: view["pose_id"])
     return [
-        {**body, "table_id": scene["table_id"], "sha256": shapes[body["instance_id"]]}
+        {
+            **body,
+            "table_id": scene["table_id"],
+            "alone": scene["table_id"] is None,
+            "sha256": shapes[body["instance_id"]],
+        }
         for scene in scenes
         for body in scene["bodies"]
     ] + [{name: view[name] for name in _CAMERA} for view in inputs]

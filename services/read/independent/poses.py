@@ -64,6 +64,12 @@ def check_given(pair: StoredPair) -> Iterator[str]:
     if pair.given is None:
         return
     view, (objects, cameras), wanted = pair.views["input"], pair.given, list[tuple[str, Array, Array]]()
+    if pair.is_studio:  # the world's origin is where the table has the first object
+        (name, T), *_ = objects
+        objects, cameras = [(name, T)], [] if T is None else cameras
+        if T is not None:
+            shift = _transform(np.eye(3), (-T[:3, 3]).tolist())
+            objects, cameras = [(name, shift @ T)], [shift @ each for each in cameras]
     if KEPT in pair.scene["effects"]:
         if [name or body["instance_id"] for body, (name, _) in zip(pair.bodies, objects, strict=False)] != [
             body["instance_id"] for body in pair.bodies
@@ -71,7 +77,7 @@ def check_given(pair: StoredPair) -> Iterator[str]:
             yield "objects are not those of scenes_from"
         there = [(f"T_world_obj of region {body['region_id']}", matrix(body, "T_world_obj")) for body in pair.bodies]
         wanted = [(*each, T) for each, (_, T) in zip(there, objects, strict=False) if T is not None]
-    if pair.has_given_cameras:
+    if pair.has_given_cameras and cameras:
         number = view["parent_id"] // 2 % pair.job["pairs_per_scene"]
         wanted.append(("T_world_cam of the input view", matrix(view, "T_world_cam"), cameras[number]))
     yield from (

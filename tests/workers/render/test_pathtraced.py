@@ -30,6 +30,7 @@ from tests.workers.render.random_scenes import (
     orbit_and_mirror,
     paths,
     procedural_things,
+    quad,
     random_things,
     shape_of,
     small,
@@ -39,7 +40,15 @@ from tests.workers.render.random_scenes import (
 )
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, invert, pose, rotation_about, translation
-from workers.render.pathtraced import draw_view, encode_light, lamp_directions, sky_directions, sky_picture
+from workers.render.pathtraced import (
+    WINDOW_LIFT_M,
+    WINDOW_TIMES,
+    draw_view,
+    encode_light,
+    lamp_directions,
+    sky_directions,
+    sky_picture,
+)
 from workers.render.tiers import require_mitsuba
 
 
@@ -84,6 +93,50 @@ def test_a_pane_of_glass_shows_what_is_behind_it_and_none_does_without_the_effec
     )
     assert clear[0] > 2.0 * clear[1]
     assert solid[0] == pytest.approx(solid[1], rel=0.05)
+
+
+def under_a_polygon(corners, point, normal):
+    """Irradiance from a polygon [N, 3] of radiance 1, all of it before the surface (Lambert 1760)."""
+    towards = (corners - point) / np.linalg.norm(corners - point, axis=1, keepdims=True)
+    after = np.roll(towards, -1, axis=0)
+    across = np.cross(towards, after)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return 0.5 * abs(np.arccos((towards * after).sum(axis=1)) @ across @ normal)
+
+
+@traced
+@pytest.mark.parametrize("quarters", [0, 3])
+def test_a_window_lights_what_faces_it_as_a_rectangle_does_and_is_seen_as_bright_as_it_is(tracer, quarters):
+    """Without light that is thrown back, an upright and a level paper; nothing behind a screen; and the sky is not seen."""
+    T, level = pose(rotation_about(UP, quarters * np.pi / 2), np.zeros(3)), (0.3, 0.4, 0.5)
+    look, radiance = (
+        Appearance(BLACK, (Light(frozen_array(UP), level),), (0.1, 0.2, 0.3)),
+        4.0 * WINDOW_TIMES * np.array(level),
+    )
+    panes = [
+        Placed(1, with_material(shape_of(trimesh.creation.box(bounds=BOX).apply_transform(T)), material), EYE)
+        for material in (Material(), Material((1.0, 1.0, 1.0, 1.0), emission=4.0))
+    ]
+    lamp, at = np.array([1.98 - WINDOW_LIFT_M, 0.1, 1.0]) + [0.0, 0.7, 0.5] * UPRIGHT, np.array([0.4, 0.1, 0.4])
+    screen = [Placed(3, quad(at + [1.0, 0.0, 0.0] + 0.8 * UPRIGHT), T)]
+    for paper, normal, between in ((UPRIGHT, [1, 0, 0], []), (LEVEL, [0, 0, 1], []), (UPRIGHT, [1, 0, 0], screen)):
+        view = camera(small(12, 12, fx=200.0, fy=200.0), T @ orbit_pose(at, 1.2 * normal[2], 0.3, 0.3))
+        things = [Placed(1, quad(at + 0.05 * paper, material=matte(0.5)), T), *between]
+        without_it, seen = (
+            tracer.radiance([*things, pane], look, view, *without(paths(64), "global_illumination"), 0)
+            for pane in panes
+        )
+        expected = 0.0 if between else 0.5 / np.pi * radiance * under_a_polygon(lamp, at, np.array(normal))
+        assert (seen - without_it).mean((0, 1)) == pytest.approx(expected, rel=0.02, abs=1e-4)
+    ahead = camera(small(40, 30), T @ orbit_pose(np.array([2.0, 0.1, 1.0]), 0.0, np.pi, 1.5))
+    seen = tracer.radiance(panes[1:], look, ahead, *paths(4), 0)
+    assert seen[10:20, 15:25] == pytest.approx(np.broadcast_to(radiance, (10, 10, 3)), rel=1e-4)
+    assert seen[0] == pytest.approx(np.broadcast_to(look.background, (40, 3)), abs=1e-6)
+
+
+BOX = ((1.98, -0.6, 0.5), (2.0, 0.8, 1.5))
+UPRIGHT = np.array([[0.0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]])
+LEVEL = UPRIGHT[:, [1, 2, 0]]
 
 
 def cast(tracer, things, view):

@@ -17,7 +17,8 @@ import pytest
 
 from schemas.errors import AssetSourceError, OutputError, SettleError
 from schemas.scene.scene import EffectPlan
-from schemas.scene.shape import Asset
+from schemas.scene.shape import REGION_FIRST_OBJECT, Asset
+from services.dataset.dataset import open_dataset
 from services.job.job_file import validate_job
 from services.job.record import record_job
 from services.read import audit
@@ -127,6 +128,39 @@ def test_another_tier_and_other_cameras_keep_the_geometry(drawn, tmp_path):
     assert bodies == [[(b["instance_id"], b["T_world_obj"]) for b in row["bodies"]] for row in rows_of(drawn, "scenes")]
 
 
+def test_a_studio_dataset_as_a_table_gives_depth_and_regions_byte_for_byte_in_another_light_and_tier(tmp_path):
+    job: dict[str, Any] = {**ALONE, "studio": UNIT, "pairs_per_scene": 2}
+    first, _ = make_dataset(tmp_path / "a", **job, start={"pose": "tumbled"})
+    changes = {"seed": 12, "render": {"tier": "flat"}, "cameras": {"more": [{"name": "around", "ring": {"count": 3}}]}}
+    again, _ = make_dataset(tmp_path / "b", **job, **changes, scenes_from=str(first.root))
+    before, now = images_of(first), images_of(again)
+    for path, digest in before.items():
+        assert (now[path] == digest) == ("RGB" not in path)
+    assert (
+        len(now) > len(before) and faults_of(again) == audit.verify_independently(again, 2, lambda _: None).faults == []
+    )
+    (failed, *_) = rows_of(make_dataset(tmp_path / "c", scenes_from=str(first.root))[0], "failures")
+    assert failed["reason"] == "no_table" and "has scenes of a studio: set scene: studio" in failed["detail"]
+
+
+def test_a_studio_shows_the_first_object_of_a_scene_on_a_table_as_its_cameras_saw_it(drawn, tmp_path):
+    """Its depth where nothing stood before it, to one unit of what is stored."""
+    job = {**ALONE, "scenes_from": str(drawn.root), "scenes": 3, "pairs_per_scene": 2, "categories": ["box", "can"]}
+    alone, _ = make_dataset(tmp_path / "a", **job)
+    assert faults_of(alone) == audit.verify_independently(alone, 3, lambda _: None).faults == []
+    for scene in rows_of(alone, "scenes"):
+        assert len(scene["bodies"]) == 1 and scene["T_world_obj"][3:12:4] == [0.0] * 3
+    both = ([pair.views["input"] for pair in open_dataset(store.root).pairs()] for store in (drawn, alone))
+    for there, here in zip(*both, strict=True):
+        seen = there.segment() == REGION_FIRST_OBJECT
+        assert seen.any() and (here.segment()[seen] == REGION_FIRST_OBJECT).all()
+        assert np.abs(here.depth_m() - there.depth_m())[seen].max() < 2.1e-4
+
+
+ALONE: dict[str, Any] = {"scene": "studio", "categories": ["box"]}
+UNIT = {"scale": "unit_cube"}
+
+
 @pytest.mark.minute
 def test_clutter_falls_over_a_kept_scene_and_moves_nothing(again, tmp_path):
     look = {"look": {"clutter": {"count": [3, 3]}}, "scenes_from": str(again.root)}
@@ -197,6 +231,11 @@ def test_a_bop_scene_of_other_models_stands_where_their_own_frames_say(tmp_path)
     inputs = [view for view in rows_of(store, "views") if view["role"] == "input"]
     assert [(view["fx"], view["cx"], view["cy_opencv"]) for view in inputs] == [(140.0, 80.5, 60.0)] * 2
     assert faults_of(store) == audit.verify_independently(store, 1, lambda _: None).faults == []
+    alone, _ = make_dataset(tmp_path / "alone", **job, scenes_from=str(folder), scene="studio", studio=UNIT)
+    (turned,), (first,) = rows_of(alone, "scenes"), rows_of(alone, "views")
+    pairs = (first["T_world_cam"], turned["T_world_obj"]), (inputs[0]["T_world_cam"], scene["T_world_obj"])
+    seen = [invert(np.reshape(camera, (4, 4))) @ np.reshape(body, (4, 4)) for camera, body in pairs]
+    assert np.abs(np.subtract(*seen)).max() < 1e-9
 
 
 PLANE = np.array([0.3, 0.5, 0.81])

@@ -28,7 +28,7 @@ from workers.physics.pour import Pouring, points_of
 from workers.physics.support import columns_apart, place_table, sample_elevation, support_height, support_margin
 from workers.scene.cameras import draw_camera
 from workers.scene.chance import SceneChance, Stream
-from workers.scene.draw.given import choose_given, put_given, read_given
+from workers.scene.draw.given import choose_given, put_alone, put_given, read_given
 from workers.scene.draw.studio import draw_studio
 
 MOST_REDRAWS = 20
@@ -48,9 +48,11 @@ def plan_scene(job: Job, catalogue: Catalogue, chance: SceneChance) -> ScenePlan
     """Everything about a scene that chance decides. Raises MeshError where an asset is unfit, StartError as `draw_scene`."""
     objects, table = choose_assets(job, catalogue, chance)
     assets = [load_asset(catalogue, ref) for ref in objects]
+    given = read_given(job, catalogue, chance.scene_id)
     if job.scene == "studio":
-        return draw_studio(job, chance, assets[0])
-    return draw_scene(job, chance, load_asset(catalogue, table), *assets, given=read_given(catalogue, chance.scene_id))
+        plan = draw_studio(job, chance, assets[0])
+        return plan if given is None else put_alone(plan, job, given, assets[0])
+    return draw_scene(job, chance, load_asset(catalogue, table), *assets, given=given)
 
 
 def choose_assets(job: Job, catalogue: Catalogue, chance: SceneChance) -> tuple[list[InstanceRef], InstanceRef]:
@@ -59,7 +61,7 @@ def choose_assets(job: Job, catalogue: Catalogue, chance: SceneChance) -> tuple[
     Where a job names the instances of splits, an object is drawn until it is of one, and each further object, with its category,
     until it is of the first one's. A table of scenes has them by name. Raises StartError where none of `MOST_DRAWS` is.
     """
-    if (given := read_given(catalogue, chance.scene_id)) is not None:
+    if (given := read_given(job, catalogue, chance.scene_id)) is not None:
         return choose_given(catalogue, chance, given)
     objects, split = list[InstanceRef](), job.assets.split
     fit = {*SPLITS}
