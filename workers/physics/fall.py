@@ -105,6 +105,8 @@ SKIPPED_TO_M = 2e-4
 TOP_S = 2.0 * LEAST_BOUNCE_M_S / GRAVITY_M_S2
 """Time for which what bounces is as slow about the top of its flight as impacts that do not bounce."""
 
+DISCARDED_S = 1.0
+"""Time from which a fall may end because it is discarded: what leaves a flat top has by then, and falls onto the mesh instead."""
 
 THROWN, SLOW_M_S = 3.0, 0.5
 """Ratio of a speed to that of a fall from the highest start, from which long steps threw an object: of two balls that fall as one
@@ -271,7 +273,7 @@ class _Simulation:
                 self._find_thrown()
                 self._put_away()
             self.speeds = _speeds(self.bodies, self.moving)
-            if self.energy.rise(self.watch.lowest_m) >= self.watch.most_rise:
+            if self.time > DISCARDED_S and self.energy.rise(self.watch.lowest_m) >= self.watch.most_rise:
                 return self._outcome(max(self.speeds), False, "rise")
             for name, stop in self.watch.stops.items():
                 if any(stop(number, pose) for number, pose in enumerate(self.at)):
