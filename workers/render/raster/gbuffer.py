@@ -186,7 +186,10 @@ class Renderer:
         """
         self.prepare_light(things, appearance, render, effects)
         k, color = camera.intrinsics, effects.runs("rgb") and render.tier != "pathtraced"
-        view = RenderPass(appearance, k, invert(camera.T_world_cam), effects, color, _is_lit(render, effects))
+        lit = _is_lit(render, effects)
+        view = RenderPass(
+            appearance, k, invert(camera.T_world_cam), effects, color, lit, open=lit and self._light_maps.absent
+        )
         self._target.bind(k.width, k.height)
         self._gl.glEnable(self._gl.GL_DEPTH_TEST)
         ground = find_ground(things, view)
@@ -252,7 +255,7 @@ class Renderer:
             if view.raster:
                 program.set_ambience(view)
             for draw in draws:
-                if view.raster:
+                if view.raster and not view.open:
                     self._light_maps.bind(program, draw.thing)
                 bias = DEPTH_BIAS * ranks[draw.thing.region_id]
                 if variant.plain:
