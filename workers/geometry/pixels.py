@@ -383,8 +383,7 @@ def _draw(points: Array, focal: tuple[float, float, float, float], lens: Array, 
 
 def is_inner(region: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """[H, W]: the pixels that, with all eight beside them, show something; region [H, W]. None at the image's edge does."""
-    shown = (region > 0).astype(np.uint8)
-    inner: NDArray = cv2.erode(shown, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    inner: NDArray = cv2.erode(region, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return inner > 0
 
 
