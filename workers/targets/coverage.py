@@ -129,6 +129,15 @@ def _cover(
         for row in range(first // lines, (last + lines - 1) // lines):
             if following[row, max(int(left), 0)] > right:
                 continue
+            # Where the face is in this row, to a pixel.
+            least, most = right, left
+            for y in (max(low, row), min(high, row + 1.0), middle):
+                if row <= y <= row + 1.0:
+                    at = x + (y - low) * whole
+                    other = x + (y - low) * upper if y < middle else bend + (y - middle) * lower
+                    least, most = min(least, at, other), max(most, at, other)
+            if following[row, max(int(least - 1.0), 0)] > most + 1.0:
+                continue
             start, stop = max(first - row * lines, 0), min(last - row * lines, lines)
             least, most = np.float64(width), 0.0
             for n in range(stop - start):

@@ -22,7 +22,7 @@ from workers.geometry.camera import NEAR_M
 from workers.geometry.frames import transform
 from workers.geometry.irradiance import turn_polynomials
 from workers.render.raster.batches import Cover, is_matte, seen_ranges, texture_of
-from workers.render.raster.buffers import Uploaded, UploadedShape
+from workers.render.raster.buffers import FEW_OPEN, Uploaded, UploadedShape
 from workers.render.raster.shaders import Variant
 
 LEVEL_UNIT, SHADOW_UNIT = 1, 2
@@ -274,7 +274,8 @@ def sort_draws(
                 matte = ground and planar and batch.matte
                 if matte:
                     matte = level if raster else textured or is_plain(thing.shape, view)
-                look = (view.color, textured, batch.few_triangles, matte, lights, raster)
+                few = batch.few_triangles or (view.open and batch.index_count <= 3 * FEW_OPEN)
+                look = (view.color, textured, few, matte, lights, raster)
                 place = (ground, level, view.open, view.labels)
                 variant = Variant(*look, *place, cutout, planar, ground and not ground_z, view.around is not None)
                 by_variant.setdefault(variant, []).append(Draw(thing, T_cam_shape, batch, culls, first, count))

@@ -297,7 +297,7 @@ class Renderer:
             return
         mask = find_edges(rgb, region, sum(thing.region_id == REGION_FLOOR for thing in things) > 1)
         if view.effects.runs("alpha"):
-            mask[~is_inner(region)] = 0  # alpha has the outline: a blend with what is behind would darken it
+            mask *= is_inner(region)  # alpha has the outline: a blend with what is behind would darken it
         if not view.effects.runs("samples"):
             smooth_edges(rgb, mask)
             return
