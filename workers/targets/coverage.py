@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from schemas.base import Array
 from workers.geometry.camera import project
 from workers.geometry.jit import compiled_for
-from workers.geometry.pixels import is_inner
+from workers.geometry.pixels import is_inner, shown_part
 from workers.targets.surfaces import Triangles
 
 SAMPLES = 64
@@ -37,7 +37,9 @@ def cover_pixels(triangles: Triangles, region: NDArray[np.uint8]) -> NDArray[np.
     # Of a closed body the faces that look away cover nothing but what the others do.
     seen = ~triangles.closed | (triangles.planes[1] < 0.0)
     faces = np.ascontiguousarray(triangles.mesh.faces[seen])
-    open_from = _next_open(np.ascontiguousarray(is_inner(region)[part]).view(np.uint8))
+    around = slice(max(top - 1, 0), bottom + 1), slice(max(left - 1, 0), right + 1)
+    inner = is_inner(region[around])[top - around[0].start :, left - around[1].start :][: bottom - top, : right - left]
+    open_from = _next_open(np.ascontiguousarray(inner).view(np.uint8))
     _cover(np.stack([u - left, v - top], axis=1), faces, open_from, _OFFSETS, covered)
     _write_shares(open_from, covered, _SHARES, region[part], alpha[part])
     return alpha
@@ -46,10 +48,7 @@ def cover_pixels(triangles: Triangles, region: NDArray[np.uint8]) -> NDArray[np.
 def with_alpha(rgb: NDArray[np.uint8], region: NDArray[np.uint8], alpha: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """[H, W, 4]: colour with straight alpha. A pixel whose centre shows nothing has the colour of the nearest that does."""
     image = np.zeros((*alpha.shape, 4), np.uint8)
-    rows, columns = (np.flatnonzero(alpha.any(axis=axis)) for axis in (1, 0))
-    if not len(rows):
-        return image
-    part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    part = shown_part(alpha)
     hidden = (region[part] == 0).view(np.uint8)
     if _join(rgb[part].copy(), hidden, alpha[part], image[part]) and not hidden.all():
         # Every pixel that shows something has a number of its own, from 1 on along rows.
