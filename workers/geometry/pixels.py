@@ -383,9 +383,17 @@ def _draw(points: Array, focal: tuple[float, float, float, float], lens: Array, 
 
 def is_inner(region: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """[H, W]: the pixels that, with all eight beside them, show something; region [H, W]. None at the image's edge does."""
-    shown = (region > 0).astype(np.uint8)
-    inner: NDArray = cv2.erode(shown, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    inner: NDArray = cv2.erode(region, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return inner > 0
+
+
+def shown_part(image: NDArray[np.uint8], margin: int = 0) -> tuple[slice, slice]:
+    """Rows and columns of the pixels of an image [H, W] that are not 0, and `margin` more around them; empty where all are."""
+    if not image.any():
+        return slice(0), slice(0)
+    ends = (np.flatnonzero(image.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0))
+    rows, columns = (slice(max(first - margin, 0), last + 1 + margin) for first, last in ends)
+    return rows, columns
 
 
 def fill_image(picture: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:

@@ -212,6 +212,13 @@ def _fill_missed(
     grid: tuple[float, float, float, float],
 ) -> None:
     """Gives a pixel of a region that none of its faces covers the one whose edge is nearest to the pixel's centre."""
+    some = False
+    for row in range(region.shape[0]):  # a quick look, by vectors
+        here, there = best[row], region[row]
+        for column in range(len(here)):
+            some |= (here[column] < 0) & (there[column] > 0)
+    if not some:
+        return
     has_faces = np.zeros(256, np.bool_)
     for face in range(len(faces)):
         has_faces[kinds[0][face]] = True

@@ -329,3 +329,14 @@ def test_light_is_worked_out_once_a_scene_and_none_of_another_scene_is_seen(rend
     assert one.astype(np.int64).sum() > lit[0].astype(np.int64).sum()
     for look in (dark, without(RASTER, "shadows", "ambient_occlusion")):
         assert np.array_equal(one, renderer.draw(things, APPEARANCE, view, *look).rgb)
+
+
+@pytest.mark.parametrize("light", ["key", *sorted(STUDIO_LIGHTS)])
+def test_without_light_maps_the_bytes_are_those_of_looking_up_maps_that_darken_nothing(renderer, light):
+    rng, look = np.random.default_rng(951), without(RASTER, "light_maps")
+    things, height = procedural_things(rng)
+    view, appearance = orbit_and_mirror(rng, height)[0], STUDIO_LIGHTS.get(light, APPEARANCE)
+    drawn = renderer.draw(things, appearance, view, *look)
+    with mock.patch.object(LightMaps, "absent", False):
+        assert np.array_equal(drawn.rgb, renderer.draw(things, appearance, view, *look).rgb)
+    assert len(np.unique(drawn.rgb)) > 50

@@ -136,8 +136,11 @@ FLOAT_BYTES = INDEX_BYTES = 4
 MAX_SHAPES = 512
 """Shapes on the GPU at most: 56 instances of each built-in category, and of tables."""
 
-FEW_TRIANGLES = 1000
-"""Batches of up to so many triangles are drawn by the program variant that is fast per pixel, others by the other one."""
+FEW_TRIANGLES, FEW_OPEN = 1000, 6000
+"""Batches of up to so many triangles are drawn by the program variant that is fast per pixel, others by the other one.
+
+The second is of scenes without light maps: a triangle has half of the values then.
+"""
 
 
 @dataclass(frozen=True)

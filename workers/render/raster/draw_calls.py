@@ -22,7 +22,7 @@ from workers.geometry.camera import NEAR_M
 from workers.geometry.frames import transform
 from workers.geometry.irradiance import turn_polynomials
 from workers.render.raster.batches import Cover, is_matte, seen_ranges, texture_of
-from workers.render.raster.buffers import Uploaded, UploadedShape
+from workers.render.raster.buffers import FEW_OPEN, Uploaded, UploadedShape
 from workers.render.raster.shaders import Variant
 
 LEVEL_UNIT, SHADOW_UNIT = 1, 2
@@ -195,13 +195,16 @@ class RenderPass:
     """Whether depth and region are drawn."""
     cut: bool = False
     """Whether clear texels are cut out; in a pass for colour alone."""
+    open: bool = False
+    """Whether the scene has no light maps; in tier raster."""
 
     @cached_property
     def lights(self) -> PlacedLights:
         """The lights as the camera sees them. Raises ValueError where there are too many."""
-        count = light_slots(self.appearance, self.raster)
+        dark = self.open and not any(any(light.color) for light in self.appearance.lights)
+        count = 0 if dark else light_slots(self.appearance, self.raster)
         towards, color = np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32)
-        for i, light in enumerate(self.appearance.lights):
+        for i, light in enumerate(self.appearance.lights[:count]):
             towards[i], color[i] = self.T_cam_world[:3, :3] @ light.direction, light.color
         return PlacedLights(self.appearance.ambient, towards, color)
 
@@ -265,16 +268,16 @@ def sort_draws(
             textured = view.color and is_drawn(view.effects, "textures", batch.texture is not None)
             cutout = view.cut and textured and is_drawn(view.effects, "transparency", batch.holes)
             for first, count, top in _ranges(batch, split, cover, T_cam_shape):
-                level = (split and top) or (raster and ground and not split)
+                level = view.open or (split and top) or (raster and ground and not split)
                 # Each program takes megabytes; only floors and tops of tables are large enough to gain from their own.
                 planar = view.color and batch.few_triangles and (batch.planar_top if top else batch.planar)
                 matte = ground and planar and batch.matte
                 if matte:
                     matte = level if raster else textured or is_plain(thing.shape, view)
-                look = (view.color, textured, batch.few_triangles, matte, lights, raster)
-                variant = Variant(
-                    *look, ground, level, view.labels, cutout, planar, ground and not ground_z, view.around is not None
-                )
+                few = batch.few_triangles or (view.open and batch.index_count <= 3 * FEW_OPEN)
+                look = (view.color, textured, few, matte, lights, raster)
+                place = (ground, level, view.open, view.labels)
+                variant = Variant(*look, *place, cutout, planar, ground and not ground_z, view.around is not None)
                 by_variant.setdefault(variant, []).append(Draw(thing, T_cam_shape, batch, culls, first, count))
     return by_variant
 

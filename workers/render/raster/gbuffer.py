@@ -35,8 +35,8 @@ from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FLOOR, Appearance
 from schemas.scene.view import Camera, GBuffer, Intrinsics
 from workers.geometry.frames import invert
-from workers.geometry.pixels import fill_image, fill_plane_depth, fourth_channel, is_inner
-from workers.render.raster.antialiasing import OFFSETS_PX, blend_samples, find_edges, smooth_edges
+from workers.geometry.pixels import fill_image, fill_plane_depth, fourth_channel, is_inner, shown_part
+from workers.render.raster.antialiasing import OFFSETS_PX, SPAN_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
 from workers.render.raster.context import (
     Choice,
@@ -186,7 +186,10 @@ class Renderer:
         """
         self.prepare_light(things, appearance, render, effects)
         k, color = camera.intrinsics, effects.runs("rgb") and render.tier != "pathtraced"
-        view = RenderPass(appearance, k, invert(camera.T_world_cam), effects, color, _is_lit(render, effects))
+        lit = _is_lit(render, effects)
+        view = RenderPass(
+            appearance, k, invert(camera.T_world_cam), effects, color, lit, open=lit and self._light_maps.absent
+        )
         self._target.bind(k.width, k.height)
         self._gl.glEnable(self._gl.GL_DEPTH_TEST)
         ground = find_ground(things, view)
@@ -252,7 +255,7 @@ class Renderer:
             if view.raster:
                 program.set_ambience(view)
             for draw in draws:
-                if view.raster:
+                if view.raster and not view.open:
                     self._light_maps.bind(program, draw.thing)
                 bias = DEPTH_BIAS * ranks[draw.thing.region_id]
                 if variant.plain:
@@ -292,9 +295,14 @@ class Renderer:
             self._cut_out(rgb, things, view)
         if not view.effects.runs("antialiasing"):
             return
+        if view.effects.runs("alpha"):  # which has the outline: a blend with what is behind would darken it
+            part = shown_part(region, round(SPAN_PX))  # no blend reaches farther
+            inside = rgb[part].copy()
+            if inside.size:
+                smooth_edges(inside, find_edges(inside, region[part]) * is_inner(region[part]))
+                rgb[part] = inside
+            return
         mask = find_edges(rgb, region, sum(thing.region_id == REGION_FLOOR for thing in things) > 1)
-        if view.effects.runs("alpha"):
-            mask[~is_inner(region)] = 0  # alpha has the outline: a blend with what is behind would darken it
         if not view.effects.runs("samples"):
             smooth_edges(rgb, mask)
             return

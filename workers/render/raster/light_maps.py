@@ -70,6 +70,11 @@ class LightMaps:
         self._placements.clear()
         self._baked = self._bake(things, appearance, shadows, occlusion)
 
+    @property
+    def absent(self) -> bool:
+        """Whether the scene has none: all light reaches every surface."""
+        return self._baked.floor is None
+
     def has_level_top(self, thing: Placed) -> bool:
         """Whether a thing is upright and its highest points lie on the level that objects stand on."""
         stand, T = self._baked.stand, thing.T_world_shape

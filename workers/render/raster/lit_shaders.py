@@ -39,13 +39,15 @@ vec3 around_of(vec3 n) {
 """
 
 LIT_VERTEX = """
-uniform mat4 level_from_shape;     // to (u, v, elevation above the level in units of its map)
 uniform vec3 up;                   // the world's, in the optical frame
 uniform vec3 below;
 #if SURROUND
 AROUND_TERMS
 #endif
+#if !OPEN
+uniform mat4 level_from_shape;     // to (u, v, elevation above the level in units of its map)
 out vec3 v_level;
+#endif
 #if !LEVEL
 uniform mat4 shadow_from_shape;    // to (u, v, depth) of the shadow map
 uniform mat3 shadow_normal;        // inverse transpose of its linear part
@@ -59,7 +61,9 @@ flat out vec3 v_below;
 #endif
 
 void pass_light() {
+#if !OPEN
     v_level = (level_from_shape * vec4(position, 1.0)).xyz;
+#endif
 #if !LEVEL
     v_shadow = (shadow_from_shape * vec4(position, 1.0)).xyz;
     // A face's plane n . p = d is a plane in the map too, where depth changes by -n_xy / n_z.
@@ -75,7 +79,9 @@ void pass_light() {
 """.replace("ASIDE_M", str(ASIDE_M)).replace("AROUND_TERMS", AROUND)
 
 LIT_FRAGMENT = """
+#if !OPEN
 in vec3 v_level;
+#endif
 #if FEW_TRIANGLES && !PLANAR
 flat in vec3 v_up;
 flat in vec3 v_below;
@@ -91,7 +97,9 @@ AROUND_TERMS
 #else
 #define AROUND_OF(direction) mix(v_below, v_ambient, 0.5 + 0.5 * dot(direction, v_up))
 #endif
+#if !OPEN
 uniform sampler2D level_map;
+#endif
 
 #if !LEVEL
 in vec3 v_shadow;
@@ -125,7 +133,9 @@ float key_share(float on_map, float facing) {
 TONE
 // What arrives of the sky and of the other lights, and of the key light; `facing`: the cosine of the latter's direction.
 vec2 arriving(float facing) {
-#if LEVEL
+#if OPEN
+    return vec2(1.0);
+#elif LEVEL
     return textureLod(level_map, v_level.xy, 0.0).ra;
 #else
     // A wall looks the map up in front of itself, where the map does not jump. Points high above the things there see more
@@ -152,7 +162,7 @@ vec3 shade(vec3 normal, vec3 towards_eye, vec3 albedo, float metallic, float rou
     float width = max(roughness * roughness * roughness * roughness, 0.002);
     vec3 bounced = 2.0 * dot(normal, towards_eye) * normal - towards_eye;
     vec3 sum = around * diffuse + AROUND_OF(bounced) * open * mirror;
-    for (int i = 0; i < LIGHTS; ++i) {
+    for (int i = 0; i < LIGHTS && DARK == 0; ++i) {
         float reach = max(dot(normal, v_light_towards[i]), 0.0) * (i == 0 ? lit : open);
         float miss = 1.0 - dot(bounced, v_light_towards[i]);
         float lobe = width / mix(0.5 * miss, 1.0, width);
@@ -327,7 +337,7 @@ vec3 shade_plane(vec3 tint, vec3 ray, float facing) {
     const float open = 1.0, lit = 1.0;
     vec3 shine = v_ambient, matte = v_plane_open;
 #endif
-    for (int i = 0; i < LIGHTS; ++i) {
+    for (int i = 0; i < LIGHTS && DARK == 0; ++i) {
         float lobe = 1.0 / (v_gloss.z + dot(v_lobe[i], ray));
         shine += v_gain[i] * ((i == 0 ? lit : open) * lobe * lobe);
     }

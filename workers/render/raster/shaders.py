@@ -23,7 +23,7 @@ GRAZING = 0.01
 
 
 class Variant(NamedTuple):
-    """The choices that one program is compiled for; `lights` is from 1 to `MOST_LIGHTS`."""
+    """The choices that one program is compiled for; `lights` is from 0, where none shines, to `MOST_LIGHTS`."""
 
     color: bool
     """False: depth and region alone, without textures and lights."""
@@ -37,7 +37,9 @@ class Variant(NamedTuple):
     ground: bool = False
     """The floor: tested by the rasteriser's depth, so that its hidden fragments are not shaded."""
     level: bool = False
-    """All of it lies on the level of its map, which then holds its shadows: for `raster` only."""
+    """All of it lies on the level of its map, which then holds its shadows, or is `open`: for `raster` only."""
+    open: bool = False
+    """No light map darkens it, so that none is looked up, which takes half of the time of drawing: for `raster` only."""
     labels: bool = True
     """False: colour alone, tested by the rasteriser's depth, so that hidden fragments are not shaded."""
     cutout: bool = False
@@ -281,7 +283,8 @@ void main() {
 
 def label_sources(variant: Variant, hardware: bool) -> tuple[str, str]:
     """(vertex, fragment) shader of a variant; `hardware`: for a GPU, which may fuse a product with a sum."""
-    choices = {**variant._asdict(), "plain": variant.plain}
+    choices = {**variant._asdict(), "plain": variant.plain, "dark": not variant.lights}
+    choices["lights"] = max(1, variant.lights)  # no array is empty
     head = "#version 410 core\n" + "".join(f"#define {name.upper()} {int(v)}\n" for name, v in choices.items())
     head += f"#define UNFUSED {'precise' if hardware else ''}\n"
     shine = f"((roughness) < {MATTE_ROUGHNESS} ? 0.04 : 0.0)" if variant.surround else "0.04"
