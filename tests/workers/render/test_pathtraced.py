@@ -40,15 +40,8 @@ from tests.workers.render.random_scenes import (
 )
 from workers.geometry.camera import orbit_pose
 from workers.geometry.frames import UP, invert, pose, rotation_about, translation
-from workers.render.pathtraced import (
-    WINDOW_LIFT_M,
-    WINDOW_TIMES,
-    draw_view,
-    encode_light,
-    lamp_directions,
-    sky_directions,
-    sky_picture,
-)
+from workers.render.emitters import WINDOW_LIFT_M, WINDOW_TIMES, lamp_directions, sky_directions, sky_picture
+from workers.render.pathtraced import draw_view, encode_light
 from workers.render.tiers import require_mitsuba
 
 
