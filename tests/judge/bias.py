@@ -1,6 +1,8 @@
 """How redraws and refusals bias the poses of piles, beside MuJoCo's drop of the same objects from the same starts.
 
-`python -m tests.judge.bias --scenes 60 --objects 8 --seed 2024` prints the table of docs/rest.md. Nothing is rendered.
+`python -m tests.judge.bias --scenes 64 --objects 8` prints what docs/rest.md says. Nothing is rendered. MuJoCo's contacts throw
+back nothing where the job's do not: with its own rebound, 0.14 of the speed, 8.6 ± 2.5 % of these objects leave the table, and
+not 5.5.
 """
 
 import argparse
@@ -64,7 +66,8 @@ def try_both(job: Job, scene_id: int) -> Both:
     chance = SceneChance(job.seed, scene_id)
     plan = plan_scene(job, catalogue_of(job.model_dump_json()), chance)
     top_m = plan.table.top.height_m
-    after = simulate(plan, [one.T_world_obj for one in plan.objects], job.physics, FALL_S, STEP_S)
+    begun = [one.T_world_obj for one in plan.objects]
+    after = simulate(plan, begun, job.physics, FALL_S, STEP_S, rebound=job.physics.restitution > 0.0)
     dropped = [
         lying(scene_id, one, T, top_m, bool(transform(T, one.hull.vertices)[:, 2].max() < top_m))
         for one, T in zip(plan.objects, after, strict=True)
