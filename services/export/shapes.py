@@ -21,6 +21,7 @@ from services.read.scene_geometry import Sources
 from workers.assets.glb import read_shape
 from workers.geometry.camera import NEAR_M, project_bounds
 from workers.geometry.frames import transform
+from workers.geometry.pixels import shown_part
 
 Columns = Mapping[str, Any]
 """A row of `views` or `objects`."""
@@ -129,11 +130,10 @@ def whole_silhouette(
 
 def box_of(mask: NDArray[np.bool_]) -> Box:
     """The bounding box of a mask, as bop_toolkit's `calc_2d_bbox` has it: from the first pixel to the last, their difference."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
+    rows, columns = shown_part(mask)
+    if not rows.stop:
         return -1, -1, -1, -1
-    x, y = int(columns[0]), int(rows[0])
-    return x, y, int(columns[-1]) - x, int(rows[-1]) - y
+    return columns.start, rows.start, columns.stop - 1 - columns.start, rows.stop - 1 - rows.start
 
 
 def _window(points_cam: Array, k: Intrinsics) -> tuple[int, int, int, int]:

@@ -238,9 +238,8 @@ def verify_independently(
         fallen = set[int]()
         if catalogue and catalogue.scenes is not None:
             rows = read_scene(catalogue.scenes, scene_id)
-            settles = [each.settle and job["scene"] != "studio" for each in rows.objects]
-            each_T = zip(rows.objects, settles, strict=True)
-            kept = [None if each.of_source or falls else each.T_world_obj for each, falls in each_T]
+            falls = job["scene"] != "studio"
+            kept = [None if each.of_source or (each.settle and falls) else each.T_world_obj for each in rows.objects]
             given = (
                 [(each.instance_id, T) for each, T in zip(rows.objects, kept, strict=True)],
                 [T for T, _ in rows.cameras],

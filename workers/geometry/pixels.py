@@ -387,8 +387,8 @@ def is_inner(region: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return inner > 0
 
 
-def shown_part(image: NDArray[np.uint8], margin: int = 0) -> tuple[slice, slice]:
-    """Rows and columns of the pixels of an image [H, W] that are not 0, and `margin` more around them; empty where all are."""
+def shown_part(image: NDArray[np.uint8 | np.bool_], margin: int = 0) -> tuple[slice, slice]:
+    """Rows and columns of the pixels of an image [H, W] that are not 0, and `margin` more around them; empty where all are 0."""
     if not image.any():
         return slice(0), slice(0)
     ends = (np.flatnonzero(image.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0))

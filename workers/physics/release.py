@@ -193,15 +193,15 @@ def release(drop: Drop, flat: bool, paces: Sequence[Pace]) -> tuple[Outcome, Pac
     below the mesh, or among many below the top, and `room` where a single object leaves its room. Released again at the next
     pace where their energy rose, where one flew off, and where several did not rest.
     """
-    most_rise = KNOWN_RISE if drop.single else MOST_RISE
+    looked, most_rise = (LOOK_STEPS, KNOWN_RISE) if drop.single else (SAMPLE_STEPS, MOST_RISE)
     for pace in paces[:-1]:
-        outcome = _release(drop, flat, pace, LOOK_STEPS if drop.single else SAMPLE_STEPS, most_rise)
+        outcome = _release(drop, flat, pace, looked, most_rise)
         if drop.single and DOUBTFUL_RISE <= outcome.rise < KNOWN_RISE:
             outcome = _release(drop, flat, pace, 1, most_rise)
         slow_enough = outcome.rise < most_rise and not outcome.thrown
         if slow_enough and (drop.single or outcome.rested or outcome.stopped_by):
             return outcome, pace
-    return _release(drop, flat, paces[-1], LOOK_STEPS if drop.single else SAMPLE_STEPS, math.inf), paces[-1]
+    return _release(drop, flat, paces[-1], looked, math.inf), paces[-1]
 
 
 def _release(drop: Drop, flat: bool, pace: Pace, looked: int, most_rise: float) -> Outcome:

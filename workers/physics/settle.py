@@ -152,7 +152,7 @@ def _settle_in_ways(drop: Drop, forms: Sequence[Form]) -> tuple[Settled, ...]:
         except UnsupportedError:
             if used <= set(last):  # the last way would be the same once more
                 raise
-    return describe(_on_top_or_mesh(drop, partial(_come_to_rest, forms=forms, paces=last)))
+    return describe(_on_top_or_mesh(drop, partial(_come_to_rest, forms=forms, paces=last, used=set())))
 
 
 Result = TypeVar("Result")
@@ -173,9 +173,7 @@ def add_effects(effects: EffectPlan, names: Iterable[str]) -> EffectPlan:
     return dataclasses.replace(effects, ran=(*effects.ran, *names))
 
 
-def _come_to_rest(
-    drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence[Pace], used: set[Pace] | None = None
-) -> Ending:
+def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence[Pace], used: set[Pace]) -> Ending:
     """Release at these paces until at rest, and add to `used` those that a release ended at.
 
     The simulation may end with objects that rolling friction or a shape's margin holds out of balance. They are followed
@@ -184,7 +182,7 @@ def _come_to_rest(
     exact, heaped, seconds = drop.physics.exact_rest, bool(drop.lying), drop.seconds
     if exact and (landed := land(drop, flat, forms)) is not None:
         return Ending(drop, *landed)
-    placement, moved, used = None, 0, set[Pace]() if used is None else used
+    placement, moved = None, 0
     most = POURED_RELEASES if heaped else MOST_RELEASES
     for _ in range(most):
         outcome = _release(_briefly(drop, POURED_S) if heaped and exact else drop, flat, paces, used)

@@ -66,8 +66,9 @@ def check_given(pair: StoredPair) -> Iterator[str]:
     view, (objects, cameras), wanted = pair.views["input"], pair.given, list[tuple[str, Array, Array]]()
     if pair.is_studio:  # the world's origin is where the table has the first object
         (name, T), *_ = objects
-        objects, cameras = [(name, T)], [] if T is None else cameras
-        if T is not None:
+        if T is None:
+            objects, cameras = [(name, T)], []
+        else:
             shift = _transform(np.eye(3), (-T[:3, 3]).tolist())
             objects, cameras = [(name, shift @ T)], [shift @ each for each in cameras]
     if KEPT in pair.scene["effects"]:
