@@ -19,9 +19,8 @@ from services.read.dataset_reader import as_damage
 from services.read.independent.rays import bare_faces, cast
 from services.read.scene_geometry import Sources
 from workers.assets.glb import read_shape
-from workers.geometry.camera import NEAR_M, project_bounds
+from workers.geometry.camera import NEAR_M, project_bounds, shown_part
 from workers.geometry.frames import transform
-from workers.geometry.pixels import shown_part
 
 Columns = Mapping[str, Any]
 """A row of `views` or `objects`."""

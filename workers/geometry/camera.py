@@ -1,4 +1,4 @@
-"""The pinhole camera: its pose and frustum, projection of points, unprojection of pixels, and a choice among many views."""
+"""The pinhole camera: pose and frustum, projection of points, unprojection of pixels, bounds in the image, choice among views."""
 
 import math
 from collections.abc import Sequence
@@ -75,6 +75,15 @@ def project_bounds(points_cam: Array, intrinsics: Intrinsics, near_m: float) -> 
         return 0.0, 0.0, float(intrinsics.width), float(intrinsics.height)
     u, v = project(points_cam, intrinsics)
     return float(u.min()), float(v.min()), float(u.max()), float(v.max())
+
+
+def shown_part(image: NDArray[np.uint8 | np.bool_], margin: int = 0) -> tuple[slice, slice]:
+    """Rows and columns of the pixels of an image [H, W] that are not 0, and `margin` more around them; empty where all are 0."""
+    if not image.any():
+        return slice(0), slice(0)
+    ends = (np.flatnonzero(image.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0))
+    rows, columns = (slice(max(first - margin, 0), last + 1 + margin) for first, last in ends)
+    return rows, columns
 
 
 def image_coordinates(T_cam_obj: Pose, intrinsics: Intrinsics) -> tuple[int, int]:

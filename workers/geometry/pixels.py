@@ -387,15 +387,6 @@ def is_inner(region: NDArray[np.uint8]) -> NDArray[np.bool_]:
     return inner > 0
 
 
-def shown_part(image: NDArray[np.uint8 | np.bool_], margin: int = 0) -> tuple[slice, slice]:
-    """Rows and columns of the pixels of an image [H, W] that are not 0, and `margin` more around them; empty where all are 0."""
-    if not image.any():
-        return slice(0), slice(0)
-    ends = (np.flatnonzero(image.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0))
-    rows, columns = (slice(max(first - margin, 0), last + 1 + margin) for first, last in ends)
-    return rows, columns
-
-
 def fill_image(picture: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
     """[height, width, 3]: the middle of a picture [h, w, 3], as large as fills the image."""
     scale = max(width / picture.shape[1], height / picture.shape[0])

@@ -5,9 +5,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.base import Array
-from workers.geometry.camera import project
+from workers.geometry.camera import project, shown_part
 from workers.geometry.jit import compiled_for
-from workers.geometry.pixels import is_inner, shown_part
+from workers.geometry.pixels import is_inner
 from workers.targets.surfaces import Triangles
 
 SAMPLES = 64

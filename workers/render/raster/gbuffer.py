@@ -34,8 +34,9 @@ from schemas.job.views import Render
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FLOOR, Appearance
 from schemas.scene.view import Camera, GBuffer, Intrinsics
+from workers.geometry.camera import shown_part
 from workers.geometry.frames import invert
-from workers.geometry.pixels import fill_image, fill_plane_depth, fourth_channel, is_inner, shown_part
+from workers.geometry.pixels import fill_image, fill_plane_depth, fourth_channel, is_inner
 from workers.render.raster.antialiasing import OFFSETS_PX, SPAN_PX, blend_samples, find_edges, smooth_edges
 from workers.render.raster.buffers import INDEX_BYTES, ShapeStore, UploadedShape
 from workers.render.raster.context import (
