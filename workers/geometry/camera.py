@@ -79,11 +79,13 @@ def project_bounds(points_cam: Array, intrinsics: Intrinsics, near_m: float) -> 
 
 def shown_part(image: NDArray[np.uint8 | np.bool_], margin: int = 0) -> tuple[slice, slice]:
     """Rows and columns of the pixels of an image [H, W] that are not 0, and `margin` more around them; empty where all are 0."""
-    if not image.any():
+    values = image.view(np.uint8)  # the greatest of a line is found faster than whether there is any
+    rows = np.flatnonzero(values.max(axis=1))
+    if not len(rows):
         return slice(0), slice(0)
-    ends = (np.flatnonzero(image.any(axis=axis))[[0, -1]].tolist() for axis in (1, 0))
-    rows, columns = (slice(max(first - margin, 0), last + 1 + margin) for first, last in ends)
-    return rows, columns
+    columns = np.flatnonzero(values[rows[0] : rows[-1] + 1].max(axis=0))
+    top, left = max(int(rows[0]) - margin, 0), max(int(columns[0]) - margin, 0)
+    return slice(top, int(rows[-1]) + 1 + margin), slice(left, int(columns[-1]) + 1 + margin)
 
 
 def image_coordinates(T_cam_obj: Pose, intrinsics: Intrinsics) -> tuple[int, int]:

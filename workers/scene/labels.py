@@ -38,6 +38,9 @@ def label_regions(
     names = {} if plan.ground is None else {REGION_TABLE: ("table", plan.table.asset.instance_id)}
     names.update({start.region_id: (start.asset.category, start.asset.instance_id) for start in plan.shown})
     things = [thing for thing in posed.things if thing.region_id in names]
+    if len(posed.things) == 1 and not any(edge.any() for edge in (region[0], region[-1], region[:, 0], region[:, -1])):
+        pixels = int(np.count_nonzero(region))  # what stands alone within the image hides behind nothing
+        return label_things(things, names, camera, region, lambda *_: [pixels])
     return label_things(things, names, camera, region, count_unoccluded)
 
 

@@ -37,7 +37,7 @@ def cover_pixels(triangles: Triangles, region: NDArray[np.uint8]) -> NDArray[np.
     # Of a closed body the faces that look away cover nothing but what the others do.
     seen = ~triangles.closed | (triangles.planes[1] < 0.0)
     faces = np.ascontiguousarray(triangles.mesh.faces[seen])
-    open_from = _next_open(np.ascontiguousarray(is_inner(region)[part]).view(np.uint8))
+    open_from = _next_open(is_inner(region[part]).view(np.uint8))
     _cover(np.stack([u - left, v - top], axis=1), faces, open_from, _OFFSETS, covered)
     _write_shares(open_from, covered, _SHARES, region[part], alpha[part])
     return alpha

@@ -27,6 +27,10 @@ Array = NDArray[np.float64]
 EDGE_PX = 1.0 / 128.0
 """Distance from a projected edge, pixels, within which a centre may lie on either side."""
 
+GRAZING, GRAZING_PX, DRAWN_PX = 0.01, 1.0 / 2000.0, 1e-4
+"""Cosine of incidence below which a face is seen edge-on; how far a renderer's float32 may move a centre along such a face, and
+along others, pixels. Of 33.8 million pixels of studio scenes it is 1 / 4069 at most, and 0.00005 beyond that cosine."""
+
 NEAR_M = 0.05
 """Nearer surfaces are not seen."""
 
@@ -191,15 +195,15 @@ def cast(faces: Faces, view: Row) -> Hits:
     with np.errstate(invalid="ignore", over="ignore"):
         plane = np.nan_to_num((planes[face] * at).sum(axis=1), nan=0.0)
         inverse = np.clip(plane, least, most)
-        reach = np.nan_to_num(np.hypot(*planes[face, :2].T) * EDGE_PX, nan=np.inf)
-    sure = inside > EDGE_PX
-    reach = np.where(sure, 0.0, reach)
-    stored = np.where(sure | (plane <= 0.0), inverse, plane)
-    low = 1.0 / np.maximum(np.clip(inverse + reach, least, most), stored)
-    high = 1.0 / np.minimum(np.clip(inverse - reach, least, most), stored)
+        per_px = np.nan_to_num(np.hypot(*planes[face, :2].T), nan=np.inf)
     normals, _ = faces.plane_normals
     rays = (at - [view["cx"], view["cy"], 0.0]) / [view["fx"], view["fy"], 1.0]
     slope = np.abs((normals[face] * rays).sum(axis=1))
+    sure, edge_on = inside > EDGE_PX, slope < GRAZING * np.linalg.norm(rays, axis=1)
+    reach = per_px * np.where(sure, np.where(edge_on, GRAZING_PX, DRAWN_PX), EDGE_PX)
+    stored = np.where(sure | (plane <= 0.0), inverse, plane)
+    low = 1.0 / np.maximum(np.clip(inverse + reach, least, most), stored)
+    high = 1.0 / np.minimum(np.clip(inverse - reach, least, most), stored)
     slack = np.minimum(faces.rounding_m[face] / np.maximum(slope, 1e-300), 1.0 / least - 1.0 / most + 1e-6)
     hits = Hits(pixel, face, 1.0 / inverse, low - slack, high + slack, inside >= 0.0, sure)
     beyond = hits.where(hits.z > NEAR_M)

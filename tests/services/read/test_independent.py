@@ -25,6 +25,7 @@ import workers.scene.pairs as pairs
 from schemas.dataset.shard import Fingerprint
 from schemas.scene.view import Camera, Intrinsics
 from services.read.audit import describe_independent, verify_independently
+from services.read.independent import rays
 from services.read.independent.poses import check_forces
 from tests.captures import CAMERA, captures_job, exact_capture, use_exact_captures
 from tests.datasets import faults_of, make_dataset, overlaid, run_here
@@ -556,3 +557,24 @@ def test_forces_of_a_scene_in_balance_have_no_fault_and_each_wrong_one_is_told()
     assert "region 3: its friction is 2.0, and physics.friction gives 0.7" in pushed(2.0, None, 0.4, 0.7)
     without_rest = {"physics": {"friction": 0.7, "exact_rest": False}, "captures": None}
     assert faults(nothing_below, without_rest) == faults(nothing_below, {**JOB, "captures": {}}) == ""
+
+
+@pytest.mark.parametrize(
+    ("cosine", "right_mm", "wrong_mm"), [(0.005, 0.3, 1.5), (0.05, 0.005, 0.3), (0.7, 0.0005, 0.02)]
+)
+def test_depth_of_a_face_seen_edge_on_has_what_single_precision_moves_and_no_more(cosine, right_mm, wrong_mm):
+    """A face through (0.3, 0.2, 1) 3 m ahead, turned about y to this cosine of incidence; its ray is a pixel's centre."""
+    view = {"width": 512, "height": 512, "fx": 560.0, "fy": 560.0, "cx": 350.5 - 0.3 * 560, "cy": 300.5 - 0.2 * 560}
+    ray = np.array([0.3, 0.2, 1.0])
+    aside = np.cross(ray, [0.0, 1.0, 0.0])
+    aside, ahead = aside / np.linalg.norm(aside), ray / np.linalg.norm(ray)
+    along = cosine * aside + np.sqrt(1.0 - cosine**2) * ahead
+    up = np.cross(along, aside)
+    corners = 3.0 * ray + np.array([-0.5 * along - 0.3 * up, 0.5 * along - 0.3 * up, 0.6 * up])
+    hits = rays.cast(rays.bare_faces(corners[None]), view)
+    (number,) = np.flatnonzero(hits.pixel == 300 * 512 + 350)
+    assert hits.sure[number]
+    assert hits.z[number] == pytest.approx(3.0, abs=1e-9)
+    for off_mm in (-right_mm, right_mm):
+        assert hits.low[number] < 3.0 + off_mm / 1e3 < hits.high[number]
+    assert hits.high[number] - 3.0 < wrong_mm / 1e3 > 3.0 - hits.low[number]

@@ -132,6 +132,20 @@ def test_table_and_objects_are_labelled_in_order_the_floor_is_not_and_only_what_
     assert [label.pixels for label in nothing] == [0, 0, 0]
 
 
+def test_what_stands_alone_within_the_image_hides_behind_nothing_and_is_not_counted_again():
+    plan = dataclasses.replace(draw_scene(JOB, SceneChance(0, 0), table(), CUBE), ground=None)
+    posed = PosedScene((Placed(3, CUBE.shape, plan.objects[0].T_world_obj),), plan.appearance)
+    region = np.zeros((K.height, K.width), np.uint8)
+    region[50:60, 60:70] = 3
+    (label,) = label_regions(plan, posed, HERE, region, nothing_left)
+    assert (label.pixels, label.visible_fraction) == (100, 1.0)
+    for edge in (np.s_[0, 5], np.s_[-1, 5], np.s_[5, 0], np.s_[5, -1]):  # beyond which it goes on
+        cut = region.copy()
+        cut[edge] = 3
+        (label,) = label_regions(plan, posed, HERE, cut, lambda *_: [202])
+        assert (label.pixels, label.visible_fraction) == (101, 0.5)
+
+
 def test_what_the_processor_cannot_count_is_counted_by_the_renderer():
     near, far = (Placed(n, CUBE.shape, HERE.T_world_cam @ translation(0, 0, n)) for n in (0, 2))
     asked = []
