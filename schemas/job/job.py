@@ -68,7 +68,7 @@ class Run(Frozen):
     max_attempts: PositiveInt = 3
     """Tries of a range whose worker dies, before its scene fails as environmental."""
     scene_timeout_s: Positive = 120.0
-    """A worker that takes longer over one scene is killed."""
+    """A worker that takes longer over one scene is killed. 600 in tier pathtraced, 1800 for captures."""
     device: Literal["any", "gpu"] = "any"
     """`gpu` refuses workers that draw in software."""
     workers_per_gpu: Annotated[int, Field(ge=1, le=10_000)] | None = None
@@ -152,10 +152,15 @@ STUDIO: Keys = {
 }
 """Defaults of a job of studio scenes."""
 
+PATHTRACED: Keys = {"run.scene_timeout_s": 600.0}
+"""Default of tier pathtraced: beside other work a process may take minutes to compile what its first scene needs."""
 
-def with_studio_keys(tree: Keys) -> dict[str, Any]:
-    """A copy of a job's keys, of studio scenes with their defaults where the job does not give them."""
-    return with_defaults(tree, STUDIO if tree.get("scene") == "studio" else {})
+
+def with_kind_keys(tree: Keys) -> dict[str, Any]:
+    """A copy of a job's keys, with the defaults of studio scenes and of tier pathtraced where the job does not give them."""
+    render = tree.get("render")
+    traced = isinstance(render, Mapping) and render.get("tier") == "pathtraced"
+    return with_defaults(tree, {**(STUDIO if tree.get("scene") == "studio" else {}), **(PATHTRACED if traced else {})})
 
 
 MOST_SCENE_IDS = 10**10
@@ -233,7 +238,7 @@ class Job(Frozen):
     def _fill(cls, value: object) -> object:
         if not isinstance(value, dict):
             return value
-        return with_categories(with_capture_keys(with_preset(with_studio_keys(value))))
+        return with_categories(with_preset(with_kind_keys(with_capture_keys(value))))
 
     @field_validator("categories", mode="before")
     @classmethod

@@ -81,6 +81,13 @@ def test_a_preset_fills_the_keys_that_the_job_does_not_give():
     assert with_preset({"physics": 3})["physics"] == 3
 
 
+def test_a_scene_of_tier_pathtraced_has_longer_unless_the_job_says_how_long():
+    traced = {"render": {"tier": "pathtraced"}}
+    assert [job(**keys).run.scene_timeout_s for keys in ({}, traced)] == [120.0, 600.0]
+    assert job(**traced, run={"scene_timeout_s": 5}).run.scene_timeout_s == 5.0
+    assert job(FOLDERS, **traced).run.scene_timeout_s == 1800.0
+
+
 # ------------------------------------------------------------------------------------------------ captures
 
 

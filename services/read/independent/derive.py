@@ -121,11 +121,13 @@ class StoredPair:
     def sensor(self, view: Row) -> Mapping[str, Any]:
         """The pinhole camera of a view: the job's, or the input view's; nothing where a table not at hand may say it.
 
-        The latter of captures, and where a table of scenes has the cameras.
+        The latter of captures, where a table of scenes has the cameras, and where numbers are drawn from ranges, of which
+        cameras that stand by themselves have the middle.
         """
-        sensor: Mapping[str, Any] = self.job["cameras"]["sensor"]
-        entry = self.named.get(view["role"])
-        if self.is_captured or (self.has_given_cameras and (entry is None or entry["beside"])):
+        job_sensor, entry = self.job["cameras"]["sensor"], self.named.get(view["role"])
+        sensor = {name: np.mean(value).item() for name, value in job_sensor.items()}
+        own = self.has_given_cameras or bool(ranges_of(job_sensor))
+        if self.is_captured or (own and (entry is None or entry["beside"])):
             sensor = {name: self.views["input"][name] for name in sensor}
         if entry is None or not entry["poses"]:
             return sensor if entry is None else sensor_of(entry, sensor)
@@ -238,6 +240,23 @@ def check_images(pair: StoredPair, view: Row) -> Iterator[str]:
             yield f"{file['path']}: bytes or sha256 in views are not the file's"
 
 
+def ranges_of(sensor: Mapping[str, Any]) -> dict[str, Sequence[float]]:
+    """[least, most] of the numbers of a job's sensor that are drawn."""
+    return {name: value for name, value in sensor.items() if isinstance(value, list)}
+
+
+def _check_drawn(ranges: Mapping[str, Sequence[float]], view: Row) -> Iterator[str]:
+    """Numbers of an input view that are drawn lie in their ranges; those of fx and fy as far along."""
+    shares = {}
+    for name, (least, most) in ranges.items():
+        if not least <= view[name] <= most:
+            yield f"{name} is {view[name]}, the job gives {least} to {most}"
+        shares[name] = (view[name] - least) / (most - least) if most > least else None
+    fx, fy = (shares.get(name) for name in ("fx", "fy"))
+    if fx is not None and fy is not None and abs(fx - fy) > ROUNDING:
+        yield f"fx and fy are {fx:.6f} and {fy:.6f} of the way along their ranges, and must be as far"
+
+
 def check_camera(pair: StoredPair, view: Row) -> Iterator[str]:
     """Ids, intrinsics in both conventions, a rigid pose, and its angles."""
     pairs, sensor, parent = pair.job["pairs_per_scene"], pair.sensor(view), view["parent_id"]
@@ -249,6 +268,8 @@ def check_camera(pair: StoredPair, view: Row) -> Iterator[str]:
     for name, value in {**derived, **sensor}.items():
         if abs(view[name] - value) > 1e-12 * abs(value):
             yield f"{name} is {view[name]}, the {'input view' if pair.is_captured else 'job'} gives {value}"
+    if view["role"] == "input" and not pair.is_captured and not pair.has_given_cameras:
+        yield from _check_drawn(ranges_of(pair.job["cameras"]["sensor"]), view)
     T = matrix(view, "T_world_cam")
     R, axis = T[:3, :3], T[:3, 2]
     if distance(R.T @ R, np.eye(3)) > ROUNDING or np.linalg.det(R) < 0 or list(T[3]) != [0, 0, 0, 1]:

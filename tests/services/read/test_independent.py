@@ -23,6 +23,7 @@ import workers.scene.cameras as cameras
 import workers.scene.labels as labels
 import workers.scene.pairs as pairs
 from schemas.dataset.shard import Fingerprint
+from schemas.job.cameras import Sensor
 from schemas.scene.view import Camera, Intrinsics
 from services.read.audit import describe_independent, verify_independently
 from services.read.independent import rays
@@ -69,7 +70,23 @@ ALONE: dict[str, Any] = {
     },
 }
 
+DRAWN: dict[str, Any] = {
+    "sensor": {
+        "width": 160,
+        "height": 120,
+        "fx": [110.0, 150.0],
+        "fy": [120.0, 140.0],
+        "cx": [76.0, 84.0],
+        "cy": [60.0, 60.0],
+    },
+    "orbit": {"radius_m": [1.2, 1.6], "roll_deg": [-30.0, 30.0], "aim_m": [-0.02, 0.02]},
+    "mirror": {"T_z_m": [1.2, 1.5]},
+    "more": NAMED[:2],
+}
+"""A range for every number of the cameras that may have one."""
+
 HEALTHY = {
+    "ranges": {"cameras": DRAWN, "pairs_per_scene": 2},
     "named": {"cameras": {"more": NAMED}, "pairs_per_scene": 2, "objects_per_scene": 2},
     "studio": {**ALONE, "scenes": 1, "targets": {"views": ["normals"]}},
     "distances": {"cameras": {"orbit": {"radius_m": [2.0, 2.8]}}},
@@ -89,7 +106,7 @@ HEALTHY = {
 }
 
 
-@pytest.mark.parametrize("name", first_of(HEALTHY, 4))
+@pytest.mark.parametrize("name", first_of(HEALTHY, 5))
 def test_a_healthy_dataset_has_no_faults(tmp_path, name):
     store, _ = make_dataset(tmp_path, **HEALTHY[name])
     found = verify_independently(store, 9, lambda _: None)
@@ -244,6 +261,28 @@ def test_a_wrong_formula_passes_plain_verify_and_not_the_second_derivation(tmp_p
     store, _ = make_dataset(tmp_path, scenes=3)
     assert faults_of(store) == []
     faults = verify_independently(store, 3, lambda _: None).faults
+    assert any(told in fault for fault in faults), faults
+
+
+@pytest.mark.parametrize(
+    ("share", "told"),
+    [
+        (lambda drawn: (drawn[0], 1.5, drawn[2]), "cx is 88.0, the job gives 76.0 to 84.0"),
+        (lambda drawn: None, "fx and fy are "),
+    ],
+)
+def test_numbers_of_a_camera_outside_their_ranges_or_not_as_far_along_are_found(tmp_path, monkeypatch, share, told):
+    fixed = Sensor.fixed
+
+    def planted(sensor: Sensor, drawn: tuple[float, float, float] = (0.5, 0.5, 0.5)) -> Sensor:
+        if changed := share(drawn):
+            return fixed(sensor, changed)
+        return fixed(sensor, drawn).model_copy(update={"fy": fixed(sensor, drawn[::-1]).fy})
+
+    monkeypatch.setattr(Sensor, "fixed", planted)
+    store, _ = make_dataset(tmp_path, scenes=1, cameras={"sensor": DRAWN["sensor"]})
+    assert faults_of(store) == []
+    faults = verify_independently(store, 1, lambda _: None).faults
     assert any(told in fault for fault in faults), faults
 
 
