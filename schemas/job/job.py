@@ -147,6 +147,7 @@ STUDIO: Keys = {
     "start.pose": "as_given",
     "cameras.orbit.radius_m": "25%",
     "cameras.mirror.enabled": False,
+    "cameras.mirror.T_z_m": "fit",
     "cameras.depth.enabled": False,
     "images.projection.enabled": False,
 }

@@ -1,4 +1,4 @@
-"""The pinhole camera: pose and frustum, projection of points, unprojection of pixels, bounds in the image, choice among views."""
+"""The pinhole camera: pose and frustum, projection of points, unprojection of pixels, bounds, near plane, choice among views."""
 
 import math
 from collections.abc import Sequence
@@ -123,6 +123,31 @@ def _side_normals(k: Intrinsics) -> Array:
     left, top = k.cx + MARGIN_PX, k.cy + MARGIN_PX
     right, bottom = k.width + MARGIN_PX - k.cx, k.height + MARGIN_PX - k.cy
     return np.array([[k.fx, 0.0, left], [-k.fx, 0.0, right], [0.0, k.fy, top], [0.0, -k.fy, bottom], [0.0, 0.0, 1.0]])
+
+
+def is_cut(corners: Array, k: Intrinsics) -> bool:
+    """Whether the near plane cuts faces, corners [F, 3, 3] in the camera's frame: some are in the picture and nearer than it.
+
+    By Sutherland and Hodgman 1974 against the sides of the picture, the camera's plane and the near plane.
+    """
+    planes = np.zeros((6, 4))
+    planes[:5, :3], planes[5] = _side_normals(k), (0.0, 0.0, -1.0, NEAR_M)
+    inside = corners @ planes[:, :3].T + planes[:, 3] > 0.0
+    near = np.flatnonzero(np.all(inside.any(axis=1), axis=1))  # others have all corners on the outer side of one plane
+    return any(len(_clip(corners[face], planes)) for face in near)
+
+
+def _clip(polygon: Array, planes: Array) -> Array:
+    """The corners [N, 3] of what of a polygon lies on the inner side of planes [P, 4], n p + d > 0."""
+    for plane in planes:
+        height = polygon @ plane[:3] + plane[3]
+        kept = list[Array]()
+        for n, (point, following) in enumerate(zip(polygon, np.roll(polygon, -1, axis=0), strict=True)):
+            here, there = height[n], height[(n + 1) % len(polygon)]
+            kept += [point] if here > 0.0 else []
+            kept += [point + (following - point) * here / (here - there)] if (here > 0.0) != (there > 0.0) else []
+        polygon = np.reshape(kept, (-1, 3))
+    return polygon
 
 
 def corner_rays(k: Intrinsics) -> Array:

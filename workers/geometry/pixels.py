@@ -85,14 +85,15 @@ def _fill_plane_depth(
 
 @compiled_for("const(u1[:,:,::1]), i4[:,::1]")
 def gather_colours(rgb: NDArray[np.uint8], source: NDArray[np.integer]) -> NDArray[np.uint8]:
-    """[H, W, 3] uint8: at each pixel the colour of the pixel of `rgb` with the flat index `source` [H, W]; black for -1."""
-    gathered = np.zeros((source.shape[0], source.shape[1], 3), np.uint8)
-    pixels = np.ascontiguousarray(rgb).reshape(-1, 3)
+    """[H, W, C] uint8: at each pixel that of `rgb` [h, w, C] with the flat index `source` [H, W], with its alpha; 0 for -1."""
+    channels = rgb.shape[2]
+    gathered = np.zeros((source.shape[0], source.shape[1], channels), np.uint8)
+    pixels = np.ascontiguousarray(rgb).reshape(-1, channels)
     for row in range(source.shape[0]):
         for column in range(source.shape[1]):
             index = source[row, column]
             if index >= 0:
-                for channel in range(3):
+                for channel in range(channels):
                     gathered[row, column, channel] = pixels[index, channel]
     return gathered
 

@@ -3,6 +3,7 @@
 How the further cameras of `cameras.more` stand follows from its entry and a stream of random numbers by its name.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,11 +18,12 @@ from schemas.dataset.layout import is_stored
 from schemas.errors import ViewError
 from schemas.job.cameras import SPHERE_SHARE, VIEW_PRESETS, Cameras, Mirror, More, Ring, Sphere, share_of
 from schemas.job.job import Job
-from schemas.scene.scene import ObjectStart, ScenePlan
+from schemas.scene.scene import ObjectStart, Placed, ScenePlan
+from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
 from schemas.scene.view import VIEW_ROLES, Camera, Intrinsics, NamedCamera, Role
 from workers.assets.poses import PoseFile, poses_of
 from workers.assets.winding import winding_numbers
-from workers.geometry.camera import NEAR_M, look_at, orbit_pose, project, yaw
+from workers.geometry.camera import NEAR_M, is_cut, look_at, orbit_pose, project, yaw
 from workers.geometry.frames import UP, half_turn, invert, pose, rotation_about, transform, translation
 from workers.geometry.zbuffer import count_covered
 from workers.scene.chance import SceneChance, Stream
@@ -178,7 +180,7 @@ def place_more(
 
     Raises ViewError where one stands below the floor, or inside of an object or of the table, or as `require_depth`.
     """
-    points = points_of(plan, poses)
+    points, things = points_of(plan, poses), things_of(plan, poses)
     for entry in job.cameras.more:
         named: Iterator[NamedCamera] = place_orbits(job, entry, chance, plan, points)
         if entry.poses is not None:
@@ -188,8 +190,9 @@ def place_more(
             stands = ((T_world @ T, own or others) for T, own in rows)
             named = (NamedCamera(entry.name, n, Camera(k, frozen_array(T))) for n, (T, k) in enumerate(stands))
         for each in named:
-            _require_room(
-                each.name, each.number, each.camera.position, plan, poses, IN_TABLE if entry.poses else ON_ORBIT
+            name = f"{each.name}, number {each.number},"
+            require_room(
+                name, each.camera, plan, things, IN_TABLE if entry.poses else OF_PRESET if entry.preset else ON_ORBIT
             )
             if entry.poses is None:
                 require_depth(job, each, points)
@@ -387,31 +390,52 @@ def _radical_inverse(number: int) -> float:
     return share
 
 
-def require_aimed(plan: ScenePlan, poses: Sequence[Pose]) -> None:
-    """Raises ViewError where an input camera of a table of scenes stands below the floor, or inside of something."""
-    for number, camera in enumerate(plan.input_cameras):
-        _require_room("input", number, camera.position, plan, poses, IN_TABLE)
-
-
-ON_ORBIT, IN_TABLE = (
-    ("raise its inclination, or its about", "take a larger radius_m, or fit"),
-    ("move it in its table",) * 2,
-)
+Moves = tuple[str, str]
 """What moves a camera up, and away from what it is in."""
 
+ON_ORBIT: Moves = ("raise its inclination, or its about", "take a larger radius_m, or fit")
+OF_PRESET: Moves = (
+    "set scene: studio, where there is no table and no floor",
+    "set scene: studio, and studio.scale: unit_sphere",
+)
+INPUT: Moves = ("raise cameras.orbit.inclination_rad", "take a larger cameras.orbit.radius_m, or fit")
+IN_TABLE: Moves = ("move it in its table",) * 2
+BESIDE: Moves = ("change its offset_m",) * 2
+OPPOSITE: Moves = ("raise the input camera", "take a larger cameras.mirror.T_z_m, or fit")
 
-def _require_room(
-    name: str, number: int, position: Array, plan: ScenePlan, poses: Sequence[Pose], moves: tuple[str, str]
-) -> None:
-    """Raises ViewError where a camera stands below the floor, or inside of an object or of the table."""
-    where = f"camera {name}, number {number}, at ({', '.join(f'{x:.3f}' for x in position)}) m"
-    if plan.ground is not None and position[2] <= 0.0:
+
+def things_of(plan: ScenePlan, poses: Sequence[Pose]) -> tuple[Placed, ...]:
+    """The table and the objects of a plan; poses: `T_world_obj` of each object."""
+    table = () if plan.ground is None else (Placed(REGION_TABLE, plan.table.asset.shape, plan.table.T_world_table),)
+    placed = zip(plan.objects, poses, strict=True)
+    return (*table, *(Placed(each.region_id, each.asset.shape, T) for each, T in placed))
+
+
+def require_inputs(plan: ScenePlan, poses: Sequence[Pose]) -> None:
+    """Raises ViewError where there is no room for an input camera, as `require_room`; poses: `T_world_obj` of each object."""
+    things, moves = things_of(plan, poses), IN_TABLE if plan.aimed else INPUT
+    for number, camera in enumerate(plan.input_cameras):
+        require_room(f"input, number {number},", camera, plan, things, moves)
+
+
+def require_room(name: str, camera: Camera, plan: ScenePlan, things: Sequence[Placed], moves: Moves) -> None:
+    """Raises ViewError where a camera stands below the floor, in a thing, or so near before one that the near plane cuts it."""
+    where = f"camera {name} at ({', '.join(f'{x:.3f}' for x in camera.position)}) m"
+    if plan.ground is not None and camera.position[2] <= 0.0:
         raise ViewError("camera_in_scene", f"{where} is below the floor: {moves[0]}")
-    things = [(each.asset.instance_id, each.asset.shape, T) for each, T in zip(plan.objects, poses, strict=True)]
-    if plan.ground is not None:
-        things.append(("the table", plan.table.asset.shape, plan.table.T_world_table))
-    for what, shape, T in things:
-        point, (low, high) = transform(invert(T), position[None, :]), shape.bounds
-        # Few cameras are in a box, and to go round one point takes as long as to sort all faces.
-        if ((point > low) & (point < high)).all() and abs(winding_numbers(point, shape.mesh)[0]) > 0.5:
+    names = {each.region_id: each.asset.instance_id for each in plan.objects} | {REGION_TABLE: "the table"}
+    for thing in things:
+        if thing.region_id == REGION_FLOOR:
+            continue
+        T, (low, high) = invert(camera.T_world_cam) @ thing.T_world_shape, thing.shape.bounds
+        box = np.array(list(itertools.product(*zip(low, high, strict=True))))
+        if transform(T, box)[:, 2].min() > NEAR_M:  # of the nearly all that are far away no vertex is looked at
+            continue
+        what, point = names[thing.region_id], transform(invert(T), np.zeros((1, 3)))
+        if ((point > low) & (point < high)).all() and abs(winding_numbers(point, thing.shape.mesh)[0]) > 0.5:
             raise ViewError("camera_in_scene", f"{where} is inside of {what}: {moves[1]}")
+        if is_cut(transform(T, thing.shape.vertices)[thing.shape.faces], camera.intrinsics):
+            raise ViewError(
+                "camera_in_scene",
+                f"{where} has {what} nearer than {NEAR_M} m before it, where nothing is seen: {moves[1]}",
+            )

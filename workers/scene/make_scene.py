@@ -12,7 +12,7 @@ from schemas.scene.shape import REGION_FLOOR, REGION_TABLE
 from schemas.scene.view import Pair, View
 from workers.physics.pour import NOTHING_MORE
 from workers.physics.settle import Rest, keep_scene, recheck_scene, settle_scene
-from workers.scene.cameras import frame_cameras, place_more, require_aimed
+from workers.scene.cameras import frame_cameras, place_more, require_inputs
 from workers.scene.chance import SceneChance
 from workers.scene.context import WorkerContext
 from workers.scene.draw.plan import plan_scene, pouring_of
@@ -107,9 +107,8 @@ def place_cameras(context: WorkerContext, plan: ScenePlan, rest: Rest) -> SceneP
     """The plan with the cameras that follow from where its objects rest. Raises ViewError."""
     shown = replace(plan, objects=plan.shown)
     poses = [each.T_world_obj for each in rest.settled[: len(shown.objects)]]
-    if plan.aimed:
-        require_aimed(shown, poses)
     framed = shown if plan.aimed else frame_cameras(context.job, shown, poses)
+    require_inputs(framed, poses)
     chance = SceneChance(context.job.seed, plan.scene_id)
     more = tuple(place_more(context.job, chance, framed, poses, context.catalogue.poses))
     return replace(framed, objects=plan.objects, more=more)

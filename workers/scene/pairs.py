@@ -19,7 +19,15 @@ from schemas.scene.view import ROLES, VIEW_ROLES, Camera, Pair, Role, View
 from workers.assets.look.surroundings import require_camera_inside
 from workers.geometry.pixels import dequantise_depth, quantise_depth
 from workers.render.pathtraced import draw_view
-from workers.scene.cameras import draw_mirror_share, place_beside, place_fixed, place_mirror_camera
+from workers.scene.cameras import (
+    BESIDE,
+    OPPOSITE,
+    draw_mirror_share,
+    place_beside,
+    place_fixed,
+    place_mirror_camera,
+    require_room,
+)
 from workers.scene.chance import SceneChance, Stream
 from workers.scene.context import WorkerContext
 from workers.scene.labels import compare_views, count_unoccluded, derive_projected, label_regions, projection_shares
@@ -71,6 +79,8 @@ def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
         if not effects.runs(effect := str(VIEW_ROLES[role].effect)):
             continue
         with stopwatch.effect(effect):
+            moves = (f"change {VIEW_ROLES[role].branch}.offset_m",) * 2
+            require_room(role, near, scene.plan, scene.posed.things, moves)
             beside.append(sense(scene, render_view(scene, role, number, near, sight), number))
     assert first.region is not None
     pair = Pair(object_distance(first.depth, first.region, images, job.cameras.mirror), first, tuple(beside))
@@ -79,6 +89,7 @@ def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
     with stopwatch.effect("mirror"):
         share = draw_mirror_share(scene.chance, job.cameras.mirror, number)
         mirror_camera = place_mirror_camera(camera, pair.d_z_m, job.cameras.mirror, share)
+        require_room("mirror", mirror_camera, scene.plan, scene.posed.things, OPPOSITE)
         exact_mirror = render_view(scene, "mirror", number, mirror_camera, sight)
         mirror = sense(scene, exact_mirror, number)
     with stopwatch.stage("check"):
@@ -102,8 +113,10 @@ def make_further(scene: SettledScene, pair: Pair, number: int) -> Iterator[View]
     cameras = {view.role: view.camera for view in pair.views}
     if not scene.effects.runs("further_views"):
         return
-    standing = scene.plan.more if number == 0 else ()
-    for named in (*standing, *place_fixed(job, cameras)):
+    standing, fixed = scene.plan.more if number == 0 else (), tuple(place_fixed(job, cameras))
+    for named in fixed:
+        require_room(named.name, named.camera, scene.plan, scene.posed.things, BESIDE)
+    for named in (*standing, *fixed):
         with scene.stopwatch.effect("further_views"):
             exact = render_view(scene, named.name, number, named.camera, sight, named.number)
             view = sense(scene, exact, number)

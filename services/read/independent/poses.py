@@ -41,17 +41,22 @@ def check_orbit(pair: StoredPair) -> Iterator[str]:
     """The input camera of a scene on its orbit."""
     orbit, T_in = pair.job["cameras"]["orbit"], matrix(pair.views["input"], "T_world_cam")
     axis = T_in[:3, 2]
-    low, high = np.sin(orbit["inclination_rad"])
+    (low, high), off = np.sin(orbit["inclination_rad"]), 0.0
     if isinstance(radius := orbit["radius_m"], str):
         share = FIT if radius == "fit" else float(radius.rstrip("% ")) / 100.0
         seen = np.count_nonzero(of_objects(pair.images["input", "region"])) / pair.images["input", "region"].size
         off = 0.0 if seen <= FIT_SLACK * share else math.inf
     else:
-        # The point looked at, where it is nearest to the vertical line through the centre, or as near as the radius allows.
-        nearest = -(T_in[:2, 3] @ axis[:2]) / max(float(axis[:2] @ axis[:2]), 1e-300)
+        # Distances from which the point looked at lies in the box of `aim_m`, axis by axis: one of them is in the radius's range.
         # The table's top has some height above the world's origin, a studio's object has its middle there.
-        target = (T_in[:3, 3] + np.clip(nearest, *np.broadcast_to(radius, 2)) * axis)[: 3 if pair.is_studio else 2]
-        off = distance(target, np.clip(target, *orbit["aim_m"]))
+        nearest, farthest = np.broadcast_to(radius, 2)
+        for at, ahead in list(zip(T_in[:3, 3], axis, strict=True))[: 3 if pair.is_studio else 2]:
+            steps = np.array(orbit["aim_m"]) - at
+            if abs(ahead) < ROUNDING:
+                off = max(off, steps[0], -steps[1])
+            else:
+                nearest, farthest = max(nearest, min(steps / ahead)), min(farthest, max(steps / ahead))
+        off = max(off, nearest - farthest)
     rolled = abs(math.degrees(math.atan2(-T_in[2, 0], -T_in[2, 1])))
     if off > ROUNDING or rolled > max(map(abs, orbit["roll_deg"])) + 1e-9:
         yield "the input camera does not look at the table's centre, or beside it, from cameras.orbit.radius_m, with its roll"
@@ -108,13 +113,14 @@ def check_poses(pair: StoredPair) -> Iterator[str]:
     expected = {
         role: T_in @ _transform(np.eye(3), beside["offset_m"]) for role, beside in derive.beside(pair.job).items()
     }
-    T_z = cameras["mirror"]["T_z_m"]
-    if isinstance(T_z, list) and "mirror" in pair.views:  # drawn: what there is, as far as it is in the range
-        there = matrix(pair.views["mirror"], "T_world_cam")
-        T_z = float(np.clip((T_in[:3, 3] + d_z * T_in[:3, 2] - there[:3, 3]) @ there[:3, 2], *T_z))
-    rolls = pair.is_captured or any(cameras["orbit"]["roll_deg"])
-    other_side = _derive_rolled_mirror if rolls else _derive_mirror
-    expected["mirror"] = expected["projected"] = other_side(T_in, d_z, MIRROR_FIT * d_z if T_z == "fit" else T_z)
+    if "mirror" in pair.views:
+        T_z = cameras["mirror"]["T_z_m"]
+        if isinstance(T_z, list):  # drawn: what there is, as far as it is in the range
+            there = matrix(pair.views["mirror"], "T_world_cam")
+            T_z = float(np.clip((T_in[:3, 3] + d_z * T_in[:3, 2] - there[:3, 3]) @ there[:3, 2], *T_z))
+        rolls = pair.is_captured or any(cameras["orbit"]["roll_deg"])
+        other_side = _derive_rolled_mirror if rolls else _derive_mirror
+        expected["mirror"] = expected["projected"] = other_side(T_in, d_z, MIRROR_FIT * d_z if T_z == "fit" else T_z)
     fixed = {f"{name}_000": entry for name, entry in pair.named.items() if entry["beside"]}
     expected |= {key: expected.get(entry["beside"], T_in) @ beside_transform(entry) for key, entry in fixed.items()}
     for role, T in expected.items():

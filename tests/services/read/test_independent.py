@@ -89,6 +89,11 @@ HEALTHY = {
     "ranges": {"cameras": DRAWN, "pairs_per_scene": 2},
     "named": {"cameras": {"more": NAMED}, "pairs_per_scene": 2, "objects_per_scene": 2},
     "studio": {**ALONE, "scenes": 1, "targets": {"views": ["normals"]}},
+    "studio, other side": {
+        "scene": "studio",
+        "cameras": {"mirror": {"enabled": True}, "orbit": {"aim_m": [-0.05, 0.05], "radius_m": [1.2, 2.0]}},
+        "images": {"projection": {"enabled": True}},
+    },
     "distances": {"cameras": {"orbit": {"radius_m": [2.0, 2.8]}}},
     "defaults": {},
     "several": {
@@ -98,7 +103,10 @@ HEALTHY = {
     },
     "frictions": {"physics": {"friction": {"mug": 0.3, "table": 1.2}}, "objects_per_scene": 2},
     "median, tar": {"cameras": {"mirror": {"percentile": 50.0}}, "output": {"layout": "tar"}},
-    "no mirror": {"cameras": {"mirror": {"enabled": False}}, "images": {"projection": {"enabled": False}}},
+    "no mirror": {
+        "cameras": {"mirror": {"enabled": False, "T_z_m": [1.0, 1.6]}},
+        "images": {"projection": {"enabled": False}},
+    },
     "no colour": {"cameras": {"depth": {"enabled": False}}, "render": {"rgb": False}},
     "noise": {"sensor": {"depth_noise": {}, "distortion": {"k1": -0.1}, "rgb_noise": {}, "exposure": {}}},
     "framed": {"cameras": {"orbit": {"radius_m": "4%"}, "mirror": {"T_z_m": "fit"}}},
@@ -106,7 +114,7 @@ HEALTHY = {
 }
 
 
-@pytest.mark.parametrize("name", first_of(HEALTHY, 5))
+@pytest.mark.parametrize("name", first_of(HEALTHY, 6))
 def test_a_healthy_dataset_has_no_faults(tmp_path, name):
     store, _ = make_dataset(tmp_path, **HEALTHY[name])
     found = verify_independently(store, 9, lambda _: None)

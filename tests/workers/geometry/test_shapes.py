@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
@@ -20,6 +21,7 @@ from tests.kit.contacts import box, mesh_of
 from workers.assets.builtin.make import make_asset
 from workers.geometry import mesh as meshes
 from workers.geometry.camera import (
+    is_cut,
     is_outside_views,
     project,
     project_bounds,
@@ -103,6 +105,30 @@ def test_no_camera_on_the_way_sees_a_point_of_what_is_outside():
             u, v = project(seen[seen[:, 2] > 0.0], k)
             assert not ((u > 0.0) & (u < k.width) & (v > 0.0) & (v < k.height)).any()
     assert outside > 500
+
+
+def test_the_near_plane_cuts_a_face_where_a_linear_program_finds_a_point_that_is_nearer_and_in_the_picture():
+    """Weights of the corners, of sum 1, so that 0 <= z <= 0.05 and the sides hold: 0 <= fx x + cx z <= width z, and for y."""
+    k, rng, found = (
+        Intrinsics(width=64, height=48, fx=60.0, fy=55.0, cx=30.0, cy=26.0),
+        np.random.default_rng(6),
+        [0, 0],
+    )
+
+    def has_point(corners: np.ndarray, beside_px: float) -> bool:
+        x, y, z = corners.T
+        u, v = k.fx * x + k.cx * z, k.fy * y + k.cy * z
+        sides = [-u - beside_px * z, u - (k.width + beside_px) * z, -v - beside_px * z, v - (k.height + beside_px) * z]
+        return linprog(
+            np.zeros(3), [*sides, z, -z], [0.0] * 4 + [0.05, 0.0], np.ones((1, 3)), [1.0], (0.0, None)
+        ).success
+
+    for _ in range(300):
+        corners = rng.normal(size=(3, 3)) * rng.uniform(0.01, 0.3) + rng.normal(size=3) * 0.04
+        cut = is_cut(corners[None], k)
+        assert has_point(corners, 0.0) <= cut <= has_point(corners, 3.0)
+        found[int(cut)] += 1
+    assert min(found) > 40
 
 
 def test_of_many_views_the_first_the_last_and_others_evenly_between_are_chosen():

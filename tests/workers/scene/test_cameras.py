@@ -1,5 +1,6 @@
 """Further cameras and studio scenes: labels by cast rays, disparity, symmetry, sizes, and what one entry leaves of another."""
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -18,6 +19,7 @@ import trimesh
 
 from schemas.errors import AssetSourceError, ViewError
 from schemas.scene.scene import ScenePlan
+from schemas.scene.view import Camera, Intrinsics
 from services.read.audit import verify_independently
 from services.read.dataset_reader import find_scene
 from tests.datasets import faults_of, make_dataset, overlaid
@@ -26,7 +28,9 @@ from tests.kit.shapes import asset_of, box
 from workers.assets.poses import open_poses, poses_of, read_poses
 from workers.capture.results import open_sources
 from workers.geometry.camera import look_at
+from workers.geometry.frames import translation
 from workers.geometry.hull import hull_of
+from workers.scene.cameras import IN_TABLE, require_room, things_of
 from workers.scene.draw.studio import scaled_to
 from workers.scene.make_scene import make_scene
 from workers.stopwatch import Stopwatch
@@ -310,6 +314,12 @@ NO_VIEW: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
         {},
         "camera a, number 0, .* is inside of the table",
     ),
+    "preset": ({"preset": "trellis"}, {}, r"camera a, number \d+, .* the table.*: set scene: studio"),
+    "beside": (
+        {"beside": "input", "offset_m": [0.0, 0.0, 0.74]},
+        {"orbit": {"radius_m": 0.8}},
+        "camera a at .* has the table nearer than 0.05 m before it, .*: change its offset_m",
+    ),
     "off": (
         {"ring": {"count": 1}, "sensor": {"width": 64, "height": 48, "cx": -5.0}},
         {},
@@ -325,9 +335,35 @@ NO_VIEW: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("name", NO_VIEW)
 def test_a_camera_that_cannot_stand_there_makes_a_failure_that_names_it(name):
-    entry, job, told = NO_VIEW[name]
+    entry, others, told = NO_VIEW[name]
     with pytest.raises(ViewError, match=told):
-        make(Setting({**job, "cameras": {"more": [{"name": "a", **entry}]}}))
+        make(Setting({"cameras": {**others, "more": [{"name": "a", **entry}]}}))
+
+
+def test_a_mirror_camera_within_its_object_makes_a_failure_with_the_remedy():
+    for T_z_m, told in (
+        (0.01, "camera mirror at .* is inside of can.*: take a larger cameras.mirror.T_z_m, or fit"),
+        ("fit", ""),
+    ):
+        with pytest.raises(ViewError, match=told) if told else contextlib.nullcontext():
+            cameras = {"mirror": {"enabled": True, "T_z_m": T_z_m}, "orbit": {"inclination_rad": [0.1, 0.2]}}
+            make(Setting({"scene": "studio", "cameras": cameras}))
+
+
+def test_a_camera_before_which_the_near_plane_cuts_something_has_no_room_and_one_that_looks_past_it_has():
+    """A cube of 0.2 m about (0, 0, 1): 0.049 m before its face it is cut, 0.051 m before it is not, nor where it looks aside."""
+    plan = make(alone(box(0.2, 0.2, 0.2))).scene.plan
+    things = things_of(plan, [translation(0.0, 0.0, 1.0)])
+    k = Intrinsics(**SMALL_SENSOR)
+    for place_m, aim, told in (
+        (0.149, (0.0, 0.0, 1.0), "has .* nearer than 0.05 m before it, where nothing is seen: move"),
+        (0.151, (0.0, 0.0, 1.0), ""),
+        (0.149, (0.149, 1.0, 1.0), ""),
+        (0.05, (0.0, 0.0, 1.0), "is inside of"),
+    ):
+        camera = Camera(k, look_at(np.array([place_m, 0.0, 1.0]), np.array(aim)))
+        with pytest.raises(ViewError, match=told) if told else contextlib.nullcontext():
+            require_room("a", camera, plan, things, IN_TABLE)
 
 
 def test_a_preset_that_stands_nearer_to_a_metric_object_than_depth_begins_is_a_failure_with_both_remedies():
