@@ -30,12 +30,10 @@ from services.export.formats import Writer
 from services.export.source import (
     MM_PER_M,
     ExportScene,
-    all_drawn,
     depth_of,
     drawn,
     in_units,
     labels_of,
-    lacks_colour,
     png_of,
 )
 from services.merge.tables import escaped
@@ -53,6 +51,7 @@ _KINDS: tuple[tuple[PixelKind, str], ...] = (("rgb", "rgb"), ("depth", "depth"),
 class MirrorRecon(Writer):
     """Writes pairs whose every image exists, and every patch of one of their objects at least."""
 
+    KEYS: ClassVar = ("render.rgb", "cameras.mirror.enabled", "images.projection.enabled")
     FRESH: ClassVar = {"next": {}, "objects": {}}
     """The next even id by category; objects `with` all their patches and those `without`."""
     HEADS: ClassVar = {_PAIRS: "category,id,scene_id,pose_id\n"}
@@ -169,15 +168,14 @@ _STEPS = np.iinfo(np.uint16).max // np.iinfo(np.uint8).max
 class Nocs(Writer):
     """Writes every drawn view that has colour and coordinates."""
 
+    KEYS: ClassVar = ("render.rgb",)
     FRESH: ClassVar = {"images": {}, "classes": CLASSES}
     HEADS: ClassVar = {_IMAGES: f"path,scene_id,pose_id,role,{','.join(_OF_VIEWS)}\n"}
 
     NEEDS: ClassVar = {"views": ("coordinates",)}
 
     def take(self, scene: ExportScene, pair: Pair) -> str:
-        """Writes the pair's images, where all have colour."""
-        if reason := lacks_colour(all_drawn(pair)):
-            return reason
+        """Writes the pair's images."""
         for view in drawn(pair):
             self._write(scene, view)
         return ""

@@ -32,7 +32,7 @@ from services.export.shapes import (
     vertex_colors,
     whole_silhouette,
 )
-from services.export.source import ExportScene, drawn, labels_of, lacks_colour
+from services.export.source import ExportScene, drawn, labels_of
 from services.read.dataset_reader import kinds_of
 from workers.geometry.frames import invert
 from workers.store.images import encode_mask
@@ -56,6 +56,7 @@ class _Shot:
 class Bop(Writer):
     """Writes train/, val/ and test/ with a folder for each scene, and models/; `register` numbers the instances."""
 
+    KEYS: ClassVar = ("render.rgb",)
     FRESH: ClassVar = {"camera": None, "splits": {}, "images": 0, "instances": 0, "models": 0}
     HEADS: ClassVar = {_NAMES: "obj_id,category,instance_id,split,source,licence\n", _INFO: "{"}
 
@@ -69,8 +70,6 @@ class Bop(Writer):
 
     def take(self, scene: ExportScene, pair: Pair) -> str:
         """Writes the pair's images."""
-        if reason := lacks_colour(drawn(pair)):
-            return reason
         # Pair k has the images 3 k, 3 k + 1 and 3 k + 2
         first = len(DRAWN_ROLES) * scene.pairs.index(pair)
         shots = [self._shot(scene, view, first + DRAWN_ROLES.index(view.role)) for view in drawn(pair)]

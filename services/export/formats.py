@@ -7,6 +7,7 @@ import json
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, Final, Literal
 
@@ -90,16 +91,20 @@ class Writer:
     """Writes one format into an `ExportFolder`.
 
     `kept` is what a new writer must know to go on from here, as JSON holds it; FRESH is that of the beginning. HEADS: how the
-    lists begin that grow pair by pair. NEEDS: names by branch of the job's `targets`.
+    lists begin that grow pair by pair. NEEDS: names by branch of the job's `targets`. KEYS: those of the job that must be on.
     """
 
     FRESH: ClassVar[dict[str, Any]]
     HEADS: ClassVar[dict[str, str]] = {}
     NEEDS: ClassVar[dict[str, Sequence[str]]] = {}
+    KEYS: ClassVar[Sequence[str]] = ()
 
     @classmethod
     def check(cls, name: str, job: Job) -> None:
-        """Raises InputError where the job does not ask for the targets that the format, called `name`, is made of."""
+        """Raises InputError where the job does not ask for the images and targets that the format, called `name`, is made of."""
+        if off := [key for key in cls.KEYS if not attrgetter(key)(job)]:
+            wanted = ", ".join(f"{key}: true" for key in off)
+            raise InputError(f"{name} needs a dataset whose job has {wanted}: make it with that")
         for branch, targets in cls.NEEDS.items():
             if missing := [target for target in targets if target not in getattr(job.targets, branch)]:
                 wanted = f"a dataset whose job has targets.{branch}: [{', '.join(targets)}]"

@@ -18,7 +18,7 @@ from schemas.scene.view import DRAWN_ROLES, Role
 from services.dataset.pair import Pair
 from services.dataset.view import View
 from services.export.formats import LeftOut, Writer, encode_json
-from services.export.source import MM_PER_M, SIDES, ExportScene, all_drawn, depth_of, lacks_colour
+from services.export.source import MM_PER_M, SIDES, ExportScene, all_drawn, depth_of
 from services.read.scene_geometry import pose_shapes
 from workers.assets.glb import join_glb
 from workers.door.opening import split_glb
@@ -87,6 +87,7 @@ _SIZES: Final = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy", "cx": 
 class Nerf(Writer):
     """Writes every drawn view that has colour."""
 
+    KEYS: ClassVar = ("render.rgb",)
     FRESH: ClassVar = {"scenes": {}, "frames": 0}
 
     def add(self, scene: ExportScene) -> LeftOut:
@@ -96,9 +97,7 @@ class Nerf(Writer):
         return super().add(scene)
 
     def take(self, scene: ExportScene, pair: Pair) -> str:
-        """Writes the pair's views, where all have colour."""
-        if reason := lacks_colour(all_drawn(pair)):
-            return reason
+        """Writes the pair's views."""
         for view in all_drawn(pair):
             self._frames.setdefault(view.role, []).append(self._write(view))
         return ""

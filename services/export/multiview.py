@@ -29,7 +29,7 @@ from services.dataset.view import View
 from services.export.formats import LeftOut, Writer, encode_json, encode_npy, encode_npz
 from services.export.graphics import OPENGL_FROM_OPTICAL
 from services.export.objects import NO_SHAPE
-from services.export.source import ExportScene, alone, drawn, lacks_colour, named
+from services.export.source import ExportScene, alone, drawn, named
 from workers.geometry.frames import invert, transform
 from workers.store.images import encode_png
 
@@ -54,6 +54,7 @@ class Subject(NamedTuple):
 class MultiView(Writer):
     """A folder for each object of a scene with its views numbered from 0; `register` lists the folders by split."""
 
+    KEYS: ClassVar = ("render.rgb",)
     FRESH: ClassVar = {"objects": {}, "views": [], "fov_deg": []}
     SIDE: ClassVar[float]
     """Of the object's box, its longest, in the layout's unit."""
@@ -62,7 +63,7 @@ class MultiView(Writer):
 
     @classmethod
     def check(cls, name: str, job: Job) -> None:
-        """Raises InputError where the job lacks a target, stores no colour, or colour with lens distortion."""
+        """Raises InputError where the job lacks a target, or has lens distortion."""
         super().check(name, job)
         if job.sensor.distortion is not None:
             raise InputError(
@@ -74,8 +75,8 @@ class MultiView(Writer):
         standing = {entry.name for entry in self.record.job.cameras.more if entry.beside is None}
         around = [view for pair in scene.pairs for view in named(pair) if view.role in standing]
         views = around or [view for pair in scene.pairs for view in drawn(pair)]
-        if reason := lacks_colour(views) or (not all(map(is_square, views)) and NOT_SQUARE):
-            return [(pair.pose_id, reason) for pair in scene.pairs]
+        if not all(map(is_square, views)):
+            return [(pair.pose_id, NOT_SQUARE) for pair in scene.pairs]
         placed = ((region_id, self._place(scene, region_id)) for region_id in scene.instances)
         subjects = {region_id: subject for region_id, subject in placed if subject is not None}
         if len(subjects) < len(scene.instances):
@@ -272,6 +273,7 @@ class Trellis(MultiView):
 class Stereo(Writer):
     """Writes <scene id>-<pose id>-<camera>/im0.png, im1.png, disp0.pfm, disp1.pfm and calib.txt; im0 is of the left camera."""
 
+    KEYS: ClassVar = ("render.rgb",)
     FRESH: ClassVar = {"folders": {}}
 
     @classmethod
@@ -289,8 +291,6 @@ class Stereo(Writer):
         """Writes the folders of a pair, one for each rectified camera."""
         for entry in filter(is_rectified, self.record.job.cameras.more):
             views = [pair.views[entry.beside or ""], pair.views[entry.name, 0]]
-            if reason := lacks_colour(views):
-                return reason
             folder = f"{scene.split}/{scene.scene_id:06d}-{pair.pose_id:06d}-{entry.name}"
             for number, view in enumerate(views if entry.offset_m[0] > 0.0 else views[::-1]):
                 self.folder.put(f"{folder}/im{number}.png", view.png("rgb"))

@@ -1,6 +1,6 @@
 """What an export reads: the scenes of a dataset that were chosen, with their pairs, and what it asks of views."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -48,11 +48,6 @@ def all_drawn(pair: Pair) -> list[View]:
 def sides(pair: Pair) -> list[View]:
     """The views from other sides: `SIDES`, and those of named cameras."""
     return [*(pair.views[role] for role in SIDES if role in pair.views), *named(pair)]
-
-
-def lacks_colour(views: Iterable[View]) -> str:
-    """Why what needs the colour of these views is left out; or nothing."""
-    return next((f"no rgb of the {view.name} view" for view in views if "rgb" not in view.images), "")
 
 
 def labels_of(view: View) -> list[Mapping[str, Any]]:

@@ -229,6 +229,7 @@ def verify_independently(
         verdict.underived.append("poses are not compared with scenes_from: it is not here, or not what it was")
     views: list[Row] = []
     objects: list[Row] = []
+    absent: dict[int, str] = {}
     for scene_id in choose_scenes(store, count, record.job.seed):
         stored = find_scene(store, scene_id)
         scene = stored.scene(scene_id)
@@ -257,12 +258,16 @@ def verify_independently(
             except CorruptError as error:
                 verdict.faults.append(str(error))
             if pair.absent:
-                verdict.underived.append(f"targets of scene {scene_id} are not derived: {pair.absent[0]} is not stored")
+                absent.setdefault(scene_id, pair.absent[0])
             views += pair_views.values()
             objects += pair_objects
             verdict.pairs += 1
         verdict.scenes += 1
         progress(verdict)
+    if absent:
+        path = next(iter(absent.values()))
+        what = f"what the shapes show is not derived in {plural(len(absent), 'scene')}"
+        verdict.underived.append(f"{what}: {path} is not stored; a source with copy_assets: true has its shapes stored")
     if read_success(store) is not None:
         verdict.faults += check_merged(store.read, views, objects)
     return verdict

@@ -150,7 +150,7 @@ def check_named(pair: StoredPair) -> Iterator[str]:
             try:
                 subject = subject or _subject(pair)
             except FileNotFoundError as error:
-                pair.absent.append(str(error))
+                pair.absent.append(error.filename or str(error))
                 return
             T = np.array([matrix(view, "T_world_cam") for view in views])
             T_first = matrix(pair.views["input"], "T_world_cam")

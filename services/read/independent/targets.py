@@ -78,7 +78,7 @@ def check_targets(pair: StoredPair, view: Row) -> Iterator[str]:
     try:
         faces = faces_of(pair, view)
     except FileNotFoundError as error:
-        pair.absent.append(str(error))
+        pair.absent.append(error.filename or str(error))
         return
     if pair.targets["views"]:
         yield from _check_columns(pair, view)

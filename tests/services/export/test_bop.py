@@ -12,7 +12,6 @@ from scipy.spatial.distance import pdist
 from schemas.scene.shape import Part, Shape
 from services.export.bop import NO_SHAPE, model_info, ply_lines
 from services.export.shapes import box_of, reaches_edge, whole_silhouette
-from tests.datasets import make_dataset
 from tests.kit.shapes import shape_of
 from tests.services.export.bop_reader import load_model, load_shots, points_in_model
 from tests.services.export.exported import export_to, source_image, source_rows, without_sources
@@ -175,11 +174,7 @@ def test_captures_are_scenes_too(captures, tmp_path):
         assert ((points > low) & (points < high)).all(axis=1).mean() > 0.9
 
 
-def test_pairs_without_colour_and_hidden_objects_without_a_shape_are_left_out(pile, tmp_path):
-    store, _ = make_dataset(tmp_path / "out", scenes=1, categories=["can"], render={"rgb": False})
-    manifest = export_to(store, tmp_path / "grey", "bop").manifest
-    assert manifest["left_out"] == {"no rgb of the input view": 1}
-    assert json.loads((tmp_path / "grey" / "camera.json").read_text()) == {}
+def test_hidden_objects_without_a_shape_are_left_out(pile, tmp_path):
     bare = without_sources(pile, tmp_path / "copy")
     shutil.rmtree(bare.root / "assets")
     manifest = export_to(bare, tmp_path / "new", "bop").manifest

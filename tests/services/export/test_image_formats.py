@@ -159,6 +159,3 @@ def test_without_a_depth_camera_all_views_are_trained_on_and_a_lens_leaves_depth
     assert json.loads(text)["val_filenames"] == ["images/00000_input.png", "images/00000_mirror.png"]
     assert '"k1": 0.05' in text and "depth_file_path" not in text and not (path.parent / "masks").exists()
     assert manifest["frames"] == 2 and any("lens" in line for line in manifest["not_exported"])
-    grey, _ = make_dataset(tmp_path / "grey", scenes=1, categories=["can"], render={"rgb": False})
-    manifest = export_to(grey, tmp_path / "none", "nerf").manifest
-    assert manifest["left_out"] == {"no rgb of the input view": 1} and manifest["frames"] == 0

@@ -9,13 +9,16 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.dataset as ds
 import pytest
 
+from schemas.base import set_key
 from schemas.errors import CorruptError, InputError, InUseError, OutputError
 from schemas.job.assets import SplitShares
+from schemas.job.job import Job
 from schemas.scene.shape import Material, Part
 from services.cli.main import main
 from services.dataset import dataset as splits
@@ -326,11 +329,25 @@ def test_the_command_says_what_is_there_and_what_was_left_out(files, tmp_path, c
     answer = json.loads(lines[-1])
     assert (answer["ok"], answer["pairs"], answer["pairs_now"]) == (True, 4, 4)
     assert answer["choice"] == {"first_scene": 0, "last_scene": 1}
-    bare, _ = make_dataset(tmp_path / "bare", scenes=1, categories=["can"], images={"projection": {"enabled": False}})
+    bare, _ = make_dataset(
+        tmp_path / "bare", scenes=1, categories=["can"], images={"patch": {"width": 120, "height": 110}}
+    )
     assert main(["export", bare.name, str(tmp_path / "none"), *asked[3:]]) == 1
     told = capsys.readouterr()
-    assert "left out: 1 pair, no projected view" in told.out and "left_out.csv" in told.out
+    assert "left out: 1 pair, no patch of the " in told.out and "left_out.csv" in told.out
     assert "holds no pair: every pair was left out" in told.err
+
+
+@pytest.mark.parametrize(("name", "key"), [(name, key) for name, row in FORMATS.items() for key in row.load().KEYS])
+def test_a_job_that_has_switched_off_what_a_format_is_made_of_is_refused_before_anything_is_written(name, key):
+    keys: dict[str, Any] = {"name": "t", "assets": {"objects": [{"source": "procedural"}]}}
+    for off in (
+        {key, "images.projection.enabled"} if "mirror" in key else {key}
+    ):  # nothing is projected without a mirror view
+        set_key(keys, off, False)
+    job = Job.model_validate(keys)
+    with pytest.raises(InputError, match=f"{name} needs a dataset whose job has {key}: true"):
+        FORMATS[name].load().check(name, job)
 
 
 def test_what_cannot_be_exported_is_refused_in_a_line_with_exit_code_2(files, tmp_path, capsys, monkeypatch):
