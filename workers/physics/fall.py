@@ -143,7 +143,7 @@ class Outcome:
     face: of its hull that an object stands on, where that ended it. lost: the numbers of those that were put away; thrown: of
     those that were ever faster than a fall makes them, and the speed of the fastest, m/s. spinning: of those that do nothing but
     spin about the vertical, as fast as at first. moves: where not all rested, of what does not rest the number, the speed, m/s,
-    and the spin, rad/s.
+    and the spin, rad/s. steps: that were simulated.
     """
 
     poses: tuple[Pose, ...]
@@ -158,6 +158,7 @@ class Outcome:
     thrown_m_s: float = 0.0
     spinning: tuple[int, ...] = ()
     moves: tuple[int, float, float] = (0, 0.0, 0.0)
+    steps: int = 0
 
 
 @dataclass(frozen=True)
@@ -262,7 +263,7 @@ class _Simulation:
         slowest = min(math.hypot(*v) for v, _ in self.moving)
         self.low_m, self.top_m = min(heights), max(heights) + slowest**2 / (2.0 * GRAVITY_M_S2)
         self.lost, self.thrown, self.thrown_m_s = list[int](), set[int](), 0.0
-        self.asked_s = -1.0
+        self.asked_s, self.taken = -1.0, 0
         self.late = list[_Late]()
 
     def run(self, end_s: float) -> Outcome:
@@ -310,6 +311,7 @@ class _Simulation:
             self._read()
             self.energy.add(self.at, self.moving)
         self.time += SAMPLE_STEPS / self.rate_hz
+        self.taken += SAMPLE_STEPS
 
     def _find_thrown(self) -> None:
         """Notes bodies that are faster than a fall from the highest start makes them."""
@@ -366,7 +368,9 @@ class _Simulation:
         # What others stop begins anew, or is let go again where it stops
         rise = self.energy.rise() if name in (None, "below", "rise") else 0.0
         away = tuple(self.lost), frozenset(self.thrown), self.thrown_m_s
-        return Outcome(tuple(map(as_pose, self.at)), speed_m_s, self.time, rested, name, rise, face, *away)
+        return Outcome(
+            tuple(map(as_pose, self.at)), speed_m_s, self.time, rested, name, rise, face, *away, steps=self.taken
+        )
 
 
 def _speeds(bodies: Sequence[Body], moving: Sequence[Velocity]) -> list[float]:

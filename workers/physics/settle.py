@@ -4,6 +4,7 @@ Objects are simulated until calm, brought to exact rest, measured, and refused w
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -22,6 +23,7 @@ from schemas.scene.shape import REGION_TABLE, Mesh, Shape
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import translation
 from workers.geometry.mesh import join_meshes
+from workers.physics.contacts import DEEPEST_M
 from workers.physics.effects import ONLY_LATE, REMOVED, SPIN_LEFT, called_for, called_for_with, rooms_m
 from workers.physics.ending import Ending, UnsupportedError, describe, describe_kept, require_calm
 from workers.physics.fall import Outcome
@@ -51,6 +53,7 @@ from workers.physics.pour import (
 )
 from workers.physics.release import (
     LET_GO_COST,
+    LOST_STEPS,
     Budget,
     Drop,
     Pace,
@@ -86,7 +89,7 @@ def settle(drop: Drop) -> tuple[tuple[ObjectStart, ...], tuple[Settled, ...]]:
     Raises SettleError `objects_overlap`, `not_at_rest`, `left_table`, `unsupported` or `table_too_fine`, and LeftRoomError
     where a single object leaves its room.
     """
-    drop = dataclasses.replace(drop, budget=Budget(LET_GO_COST))
+    drop = dataclasses.replace(drop, budget=Budget(LET_GO_COST, LOST_STEPS if drop.single else math.inf))
     forms, again = forms_of(drop.starts), dict[int, int]()
     for start in drop.starts:
         require_near_origin(start)
@@ -133,7 +136,7 @@ def _without_lost(drop: Drop, lost: LostError, again: dict[int, int]) -> Drop:
     for number in lost.numbers:
         region = starts[number].region_id
         again[region] = again.get(region, 0) + 1
-        if pouring.draw is None or again[region] > pouring.most:
+        if pouring.draw is None or again[region] > pouring.most or drop.budget.falls < 0.0:
             raise lost
         starts[number] = pouring.draw(drop.starts[number], again[region], others)
         others.append(points_of(starts[number]))
@@ -185,7 +188,7 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
     placement, moved = None, 0
     most = POURED_RELEASES if heaped else MOST_RELEASES
     for _ in range(most):
-        outcome = _release(_briefly(drop, POURED_S) if heaped and exact else drop, flat, paces, used)
+        outcome, pace = _release(_briefly(drop, POURED_S) if heaped and exact else drop, flat, paces, used)
         seconds += outcome.seconds
         require_calm(drop, outcome, range(len(drop.starts)), moving=heaped and exact)
         if exact and flat and drop.single and (standing := _stand(drop, outcome, seconds)) is not None:
@@ -197,6 +200,15 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
         rested = hold(drop, placement, outcome.poses)
         if rested.still:
             return dataclasses.replace(ending, poses=rested.poses)
+        finer = paces[list(paces).index(pace) + 1 :]
+        if (
+            drop.single
+            and pace.coarse
+            and finer
+            and find_gaps_m(placement.forms, (*rested.poses, np.eye(4)))[0] < -DEEPEST_M
+        ):
+            paces = finer  # coarse parts let it in too deep for exact rest to see, which then goes through the table
+            continue
         pairs = zip(drop.starts, outcome.poses, rested.poses, strict=True)
         moved = int(np.argmax([farthest_m([start], [before], [after]) for start, before, after in pairs]))
         drop = dataclasses.replace(drop, starts=moved_to(drop.starts, rested.poses))
@@ -211,14 +223,14 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
     )
 
 
-def _release(drop: Drop, flat: bool, paces: Sequence[Pace], used: set[Pace]) -> Outcome:
+def _release(drop: Drop, flat: bool, paces: Sequence[Pace], used: set[Pace]) -> tuple[Outcome, Pace]:
     outcome, pace = release(drop, flat, paces)
     used.add(pace)
     if outcome.stopped_by == "room":
         raise LeftRoomError
     if outcome.stopped_by == "edge":
         raise LeftTopError
-    return outcome
+    return outcome, pace
 
 
 def _pour(drop: Drop, flat: bool) -> Drop:
@@ -228,7 +240,7 @@ def _pour(drop: Drop, flat: bool) -> Drop:
         if len(falling) == len(drop.starts):
             break
         few = dataclasses.replace(drop, starts=tuple(drop.starts[number] for number in falling))
-        outcome = _release(_briefly(few, WAVE_S), flat, drop.ways[0][:1], set())
+        outcome, _ = _release(_briefly(few, WAVE_S), flat, drop.ways[0][:1], set())
         poses = [start.T_world_obj for start in drop.starts]
         for number, T in zip(falling, outcome.poses, strict=True):
             poses[number] = T

@@ -242,6 +242,43 @@ def test_no_way_is_fallen_again_that_would_be_the_same_once_more(monkeypatch):
         assert [steps.base_hz for steps, _ in seen] == expected
 
 
+@pytest.mark.parametrize(("sunk_mm", "rate"), [(4.0, PACES[1].rate), (2.0, PACES[0].rate)])
+def test_what_coarse_parts_let_into_the_table_too_deep_for_exact_rest_falls_once_more_as_finer_ones(
+    monkeypatch, sunk_mm, rate
+):
+    """Exact rest is said to end so deep in the table once; less deep it is released from there."""
+    held, walled = [], tray()
+
+    def sinks(drop, placement, poses):
+        held.append(poses)
+        if len(held) > 1:
+            return hold(drop, placement, poses)
+        return Rested((translation(0.0, 0.0, -sunk_mm / 1e3) @ poses[0],), False, 0)
+
+    monkeypatch.setattr(settle, "hold", sinks)
+    seen = told_by(monkeypatch, lambda outcome: dataclasses.replace(outcome, rise=0.0))
+    starts = [put(CUBE, walled, 0.01, (0.05, 0.02), turn(Y, 44.0))]
+    settle_group(starts, walled, PHYSICS)
+    assert [steps.base_hz for steps, _ in seen] == [PACES[0].rate * PHYSICS.step_hz, rate * PHYSICS.step_hz]
+
+
+def test_a_single_object_is_not_drawn_again_once_its_falls_have_taken_their_steps(monkeypatch):
+    drawn = []
+
+    def draw(start, attempt, others):
+        drawn.append(attempt)
+        return start
+
+    for most, expected in ((math.inf, 3), (1.0, 0)):
+        drawn.clear()
+        monkeypatch.setattr(settle, "LOST_STEPS", most)
+        with pytest.raises(SettleError, match="off the table's top"):
+            settle_scene(
+                scene_of([over_edge(0.6).start], TABLE), PHYSICS, EffectPlan(ALL, {}), Pouring(draw=draw, most=3)
+            )
+        assert len(drawn) == expected
+
+
 # ---------------------------------------------------------------------------------------------- let go again
 
 
