@@ -14,7 +14,7 @@ from schemas.base import VALUE_KINDS, set_key, with_defaults
 from schemas.dataset.layout import SWITCHES, is_stored
 from schemas.errors import JobError, did_you_mean, plain_line
 from schemas.job.assets import SOURCE_KINDS, offered_by, sources_of
-from schemas.job.job import Job
+from schemas.job.job import STUDIO, Job
 from schemas.job.look import OF_COLOUR
 from services.job.bounded_yaml import MOST_LEVELS, parse_yaml
 from services.job.packed import is_packed, pack, unpack
@@ -299,6 +299,7 @@ def describe_idle(job: Job) -> list[str]:
         branch, _, name = key.rpartition(".")
         model = reduce(getattr, branch.split("."), job)
         value, usual = getattr(model, name), type(model).model_fields[name].default
+        usual = STUDIO.get(key, usual) if job.scene == "studio" else usual
         why = next((phrase for phrase, acts in needs if not acts(job)), None)
         if value != usual and why is not None:
             lines.append(f"{key} is {'given' if isinstance(value, BaseModel) else value} and has no effect: {why}")

@@ -465,3 +465,4 @@ def test_nothing_is_told_of_keys_that_act_or_are_at_their_defaults():
     assert describe_idle(job_of()) == describe_idle(job_of(changes=ON)) == []
     assert describe_idle(job_of("render.samples", 4)) == []
     assert describe_idle(job_of(changes={"render": {"rgb": False}})) == []
+    assert describe_idle(job_of(changes={"scene": "studio"})) == []
