@@ -201,14 +201,13 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
         if rested.still:
             return dataclasses.replace(ending, poses=rested.poses)
         finer = paces[list(paces).index(pace) + 1 :]
-        if (
-            drop.single
-            and pace.coarse
-            and finer
-            and find_gaps_m(placement.forms, (*rested.poses, np.eye(4)))[0] < -DEEPEST_M
-        ):
-            paces = finer  # coarse parts let it in too deep for exact rest to see, which then goes through the table
-            continue
+        if drop.single and pace.coarse and finer:
+            gap_m, _ = find_gaps_m(placement.forms, (*rested.poses, np.eye(4)))
+            if (
+                gap_m < -DEEPEST_M
+            ):  # coarse parts let it in too deep for exact rest to see, which then goes through the table
+                paces = finer
+                continue
         pairs = zip(drop.starts, outcome.poses, rested.poses, strict=True)
         moved = int(np.argmax([farthest_m([start], [before], [after]) for start, before, after in pairs]))
         drop = dataclasses.replace(drop, starts=moved_to(drop.starts, rested.poses))

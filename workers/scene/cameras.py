@@ -3,7 +3,6 @@
 How the further cameras of `cameras.more` stand follows from its entry and a stream of random numbers by its name.
 """
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -428,8 +427,9 @@ def require_room(name: str, camera: Camera, plan: ScenePlan, things: Sequence[Pl
         if thing.region_id == REGION_FLOOR:
             continue
         T, (low, high) = invert(camera.T_world_cam) @ thing.T_world_shape, thing.shape.bounds
-        box = np.array(list(itertools.product(*zip(low, high, strict=True))))
-        if transform(T, box)[:, 2].min() > NEAR_M:  # of the nearly all that are far away no vertex is looked at
+        if (
+            T[2, 3] + np.minimum(T[2, :3] * low, T[2, :3] * high).sum() > NEAR_M
+        ):  # its whole box is beyond the near plane
             continue
         what, point = names[thing.region_id], transform(invert(T), np.zeros((1, 3)))
         if ((point > low) & (point < high)).all() and abs(winding_numbers(point, thing.shape.mesh)[0]) > 0.5:

@@ -410,11 +410,10 @@ def check_projection(pair: StoredPair) -> Iterator[str]:
         yield f"projected_filled_share is {target['projected_filled_share']}, and not the share of pixels with depth"
     if ("projected", "rgb") not in pair.images or pair.job["sensor"]["distortion"]:
         return
-    carried = pair.images["projected", "rgb"]
-    carried = carried.reshape(stored.size, carried.shape[2])
-    colours = np.zeros((source["width"] * source["height"] + 1, carried.shape[1]), np.uint8)
-    colours[:-1] = pair.images["input", "rgb"].reshape(-1, carried.shape[1])
-    differs = (colours[lowest] != carried).any(axis=1)
+    sent, carried = pair.images["input", "rgb"], pair.images["projected", "rgb"]
+    channels = carried.shape[2]
+    colours = np.concatenate([sent.reshape(-1, channels), np.zeros((1, channels), np.uint8)])
+    differs = (colours[lowest] != carried.reshape(-1, channels)).any(axis=1)
     several = np.bincount(pixel[tied], minlength=stored.size) > 1
     if plain := np.count_nonzero(differs & ~several):
         yield f"{plain} colours are not those of the nearest points"
