@@ -47,7 +47,7 @@ all parts of one beside each of the other's: a step of two bowls of 700 parts ta
 
 GROUP_TRAVEL = 40.0
 """Several objects may travel so many times further in a step, 2 mm. Where they come to rest is chaotic: its distribution
-matters and not the path. At twice that corners sink into the walls of mugs, which are 2 to 3 mm thick."""
+matters and not the path."""
 
 LEFT_M = 0.05
 """Depth of a centre of mass below the table's top at which the object has left the table."""
@@ -107,12 +107,20 @@ DOUBTFUL_RISE, KNOWN_RISE = 0.4, 0.9
 """The same for a single object. From the first share a drop is repeated with a look after each step, which changes nothing of
 it; up to the second, known so, the pace was slow enough."""
 
-PACES_MANY = (Pace(rate=0.5, iterations=0.25, window=0.1, speed=10.0, thin=0.25, coarse=True), Pace(coarse=True))
-"""Of many concave objects, the second where they do not come to exact rest. Their bounces are more than a rise of energy."""
+PACES_FEW = (Pace(rate=0.5, iterations=0.25, window=0.1, speed=10.0, thin=0.25, coarse=True), Pace(coarse=True))
+"""Of two or three of many parts, the second where they do not come to exact rest. Bounces are more than a rise of energy."""
 
-PACES_POURED = (dataclasses.replace(PACES_MANY[0], rate=0.25),)
+PACES_MANY = (
+    dataclasses.replace(PACES_FEW[0], rate=0.25, travel=2.0),
+    dataclasses.replace(PACES_FEW[0], coarse=False),
+)
+"""Of many concave objects, the second for the one pile in a hundred that does not come to exact rest: coarse parts are up to
+three millimetres too small, as thick as walls. The first takes 0.74 times as long as `PACES_FEW`; what is kept, and the heights,
+places and faces of a hundred piles of eight, are the same within their intervals."""
+
+PACES_POURED = (dataclasses.replace(PACES_FEW[0], rate=0.25),)
 """Of those that fall in waves: of nine heaps of 25 in three quarters of the time. To draw again what finds no balance is sooner
-done than to drop all at a finer pace."""
+done than to drop all at a finer pace. With twice the travel, waves lie 6 % higher."""
 
 
 @dataclass
@@ -191,7 +199,9 @@ class Drop:
             return (PACES_TOGETHER[-1:],)
         if not self.many:
             return (PACES_TOGETHER, PACES_TOGETHER[-1:])
-        return (PACES_POURED,) if self.poured else (PACES_MANY[:1], PACES_MANY[1:])
+        if self.poured:
+            return (PACES_POURED,)
+        return tuple((pace,) for pace in (PACES_MANY if len(self.starts) >= MANY else PACES_FEW))
 
 
 def release(drop: Drop, flat: bool, paces: Sequence[Pace]) -> tuple[Outcome, Pace]:

@@ -32,6 +32,7 @@ from workers.physics import ending, settle
 from workers.physics import hold as holding
 from workers.physics import release as releasing
 from workers.physics.bullet import World
+from workers.physics.convex_parts import parts_of
 from workers.physics.effects import called_for
 from workers.physics.exact_rest import Rested
 from workers.physics.fall import FINEST, LOOK_STEPS, SAMPLE_STEPS, Outcome, fall
@@ -240,6 +241,23 @@ def test_no_way_is_fallen_again_that_would_be_the_same_once_more(monkeypatch):
             with pytest.raises(SettleError, match="tips or slips on without end"):
                 group_of(starts)
         assert [steps.base_hz for steps, _ in seen] == expected
+
+
+def test_a_pile_that_finds_no_balance_falls_again_as_parts_as_fine_as_they_are(monkeypatch):
+    """Coarse parts are up to three millimetres too small: walls stay in one another, however often the pile falls as they."""
+    monkeypatch.setattr(settle, "hold", lambda _drop, _placement, poses: Rested(tuple(poses), False, 0, balanced=True))
+    fine, fallen = MANY * len(parts_of(built_in("mug"), PHYSICS.concavity)), list[int]()
+
+    def counted(bodies, *given, **more):
+        fallen.append(sum(len(body.parts) for body in bodies))
+        return fall(bodies, *given, **more)
+
+    monkeypatch.setattr(releasing, "fall", counted)
+    starts = [at(built_in("mug"), TABLE, (0.2 * k - 0.3, 0.0, 0.06), LEANS) for k in range(MANY)]
+    with pytest.raises(SettleError, match="tips or slips on without end"):
+        settle_group(starts, TABLE, PHYSICS, (*ALL, "decomposition"))
+    assert max(fallen[:MOST_RELEASES]) < fine
+    assert fallen[MOST_RELEASES:] == [fine] * MOST_RELEASES
 
 
 @pytest.mark.parametrize(("sunk_mm", "rate"), [(4.0, PACES[1].rate), (2.0, PACES[0].rate)])
