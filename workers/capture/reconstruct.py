@@ -151,6 +151,13 @@ def reconstruct(given: Given, estimate: CaptureEstimate, spec: Fusion, watch: St
             f"none of the {len(estimate.used)} used views of {given.folder.path} has depth: depth_00000.png and so on are "
             "missing or empty, and without depth there is no surface",
         )
+    left_out = [view for view in estimate.views if view.status != "used"]
+    if left_out and len(views) < spec.min_views:
+        raise CaptureError(
+            "too_few_views",
+            f"{len(left_out)} of {len(estimate.views)} views are left out, and fusion.min_views is {spec.min_views}; "
+            f"view {left_out[0].number}: {'; '.join(left_out[0].reasons)}",
+        )
     with watch.stage("find_object"):
         region = find_object(views, given.folder.board, spec)
     with watch.stage("fuse"):
@@ -196,10 +203,12 @@ def estimate_poses(given: Given, spec: Estimation) -> Estimates:
     Raises CaptureError where a file cannot be read or the estimate that is asked for has no usable view.
     """
     clock = processor_clock()
+    if not given.notes:  # camera.json fits, and is nobody's to doubt
+        spec = spec.model_copy(update={"calibrate": False})
     evidence = _observe(given, spec, clock)
     if not any(seen.markers or seen.manual_T_board_cam is not None for seen in evidence.observations):
         what = f"no marker of {given.folder.board.dictionary} was found in any of {len(given.folder.numbers)} views"
-        remedy = other_board(given.folder) or "check that they are sharp, and not over-exposed"
+        remedy = other_board(given.folder) or "check that they are sharp, some twenty pixels wide and not over-exposed"
         raise CaptureError("markers", f"{given.folder.path}: {what}; {remedy}")
     check_moments(evidence)
     check_depth(evidence)

@@ -166,6 +166,18 @@ def object_moved(rng: Random) -> Flaw:
     return Flaw(LENS, LENS, T_object=lambda number: T if number < first else np.eye(4))
 
 
+def unregistered(rng: Random) -> Flaw:
+    step = np.hstack([rng.uniform(0.005, 0.02) * directions(rng), np.radians(rng.uniform(0.3, 2.0)) * directions(rng)])[
+        0
+    ]
+    T_color_depth = moved(np.eye(4), step)
+    return Flaw(LENS, LENS, T_depth=lambda poses, number: poses[number] @ T_color_depth)
+
+
+def rolling_and_scaled(rng: Random) -> Flaw:
+    return dataclasses.replace(rolling(rng), printed=scaled(rng, 0.008, 0.015, np.ones(3)).printed)
+
+
 def moved_and_centre(rng: Random) -> Flaw:
     return dataclasses.replace(centre(rng), T_object=object_moved(rng).T_object)
 
@@ -186,6 +198,8 @@ CAUSES: dict[str, tuple[Callable[[Random], Flaw], str]] = {
     "depth of the next view": (swapped, "moment swapped"),
     "object moved": (object_moved, "moved"),
     "object moved and principal point": (moved_and_centre, "camera moved"),
+    "rolling shutter and print scale": (rolling_and_scaled, "rows scale"),
+    "registration": (unregistered, ""),
 }
 """How each is drawn, and what must be said of it."""
 SAID = {

@@ -155,6 +155,32 @@ def test_a_folder_that_was_processed_with_the_markers_camera_is_read_back_with_i
 
 
 @pytest.mark.minute
+def test_too_few_views_to_merge_say_why_others_are_left_out(tmp_path):
+    path = copy_of(box(), tmp_path)
+    for number in open_folder(path).numbers[1:]:
+        rgb = path / f"rgb_{number:05d}.png"
+        cv2.imwrite(str(rgb), np.zeros_like(cv2.imread(str(rgb))))
+    with pytest.raises(
+        CaptureError, match=r"[0-9]+ of [0-9]+ views are left out, and fusion.min_views is 2; view 1: no marker"
+    ):
+        process_folder(path, Captures(estimation=Estimation(compare=False)))
+
+
+@pytest.mark.minute
+def test_a_camera_that_fits_is_kept_when_calibration_is_asked_for_and_makes_no_pose_less_certain(tmp_path):
+    """With three views a camera of the markers' own would move the poses by millimetres."""
+    path = copy_of(box(), tmp_path)
+    for number in range(3, len(open_folder(path).numbers)):
+        for name in ("rgb", "depth", "mask"):
+            path.joinpath(f"{name}_{number:05d}.png").unlink(missing_ok=True)
+    plain, asked = (Estimation(compare=False, calibrate=calibrate) for calibrate in (False, True))
+    kept, found = (estimate_poses(given_files(open_folder(path), spec), spec).estimate for spec in (plain, asked))
+    assert found.notes == kept.notes and len(found.views) == 3
+    for a, b in zip(found.views, kept.views, strict=True):
+        assert np.array_equal(a.T_board_cam, b.T_board_cam) and np.array_equal(a.covariance, b.covariance)
+
+
+@pytest.mark.minute
 @pytest.mark.shared_data
 @pytest.mark.parametrize(
     ("file", "words", "right"),

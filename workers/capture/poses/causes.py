@@ -270,8 +270,8 @@ def find_doubt(
     bent = next(t for t in tried if t.explanation.numbers == BENT)
     wide = bent if 0 < len(best.explanation.numbers) < len(BENT) else best
     if best is usual and spec.calibrate:
-        best = wide = next(t for t in tried if t.explanation.numbers == WHOLE)
-        return _doubt(best, wide, usual, start, fixed, variance, spec)
+        covariance = max(variance, 1.0) * next(t for t in tried if t.explanation.numbers == WHOLE).fitted.covariance
+        return Doubt(start.poses, np.zeros((len(start.poses), POSE)), covariance, "", True, start.camera, False)
     gain = usual.fitted.cost - best.fitted.cost
     alike = 0.25 * count * (ALIKE_PX / start.term.sigma_px[0]) ** 2  # two of a marker's eight are its place
     wanted = EXPLAINED * best.fitted.own.shape[1] * usual.fitted.cost

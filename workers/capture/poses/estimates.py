@@ -12,7 +12,7 @@ from schemas.job.captures import Estimation
 from workers.capture.poses.causes import Doubt, find_doubt
 from workers.capture.poses.joint import BoardTerm, Joint, Views, measure_corners, solve_jointly
 from workers.capture.poses.markers import AMBIGUOUS, MIN_CORNERS, Evidence, Judged, fits_board, judge
-from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation, no_patches
+from workers.capture.poses.observation import DEPTH_SIGMA_M, Corners, Observation, no_patches, side_of_patch
 from workers.capture.poses.standing import Moment, find_moment, object_groups
 from workers.capture.poses.terms import (
     NAMES,
@@ -130,7 +130,7 @@ def estimate_joint(evidence: Evidence) -> CaptureEstimate:
             still[n] = dataclasses.replace(still[n], object_patches=no_patches())
         problem = dataclasses.replace(problem, observations=tuple(still))
         joint = solve_jointly(problem, evidence.spec)
-    estimate = _result(problem, joint, doubt, moment, evidence)
+    estimate = _result(problem, joint, (doubt, explained[1]), moment, evidence)
     if len(groups) > 1:
         numbers = [[problem.observations[n].number for n in group] for group in groups]
         settled, _ = _groups(*_explained(problem, joint, doubt, evidence.spec), moment, groups[0])
@@ -214,18 +214,23 @@ def _groups(
     if moment is not None:
         shared = Shared()
         poses, unsure_m = moment.T_board_depth @ poses, np.hypot(unsure_m, moment.unsure_m)
-    groups, clutter = object_groups(seen, poses[among], shared, sigma_m, unsure_m[among])
+    within_rad = side_of_patch(problem.camera) / problem.camera.intrinsics.fx / 2
+    groups, clutter = object_groups(seen, poses[among], shared, sigma_m, unsure_m[among], within_rad)
+    if moment is None and len(groups) > 1:
+        # The board tells little of a registration that shifts depth along it: one by which all views agree on the object is true.
+        agreed = object_groups(seen, poses[among], joint.solution.shared, sigma_m, unsure_m[among], within_rad)
+        groups, clutter = agreed if len(agreed[0]) == 1 else (groups, clutter)
     return [[among[n] for n in group] for group in groups], {
         among[n]: out for n, out in enumerate(clutter) if out.any()
     }
 
 
 def _result(
-    problem: Views, joint: Joint, doubt: Doubt | None, moment: Moment | None, evidence: Evidence
+    problem: Views, joint: Joint, doubted: tuple[Doubt | None, Joint], moment: Moment | None, evidence: Evidence
 ) -> CaptureEstimate:
-    """`doubt`: what the poses may need, which makes all but given ones less certain."""
-    solution = joint.solution
-    sigma = np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0))
+    """doubted: what the poses may need, which makes all but given ones less certain, and the solution as it has them."""
+    solution, (doubt, explained) = joint.solution, doubted
+    sigma = _sigma_shared(joint)
     correction = correct_depth(solution.shared, sigma, joint.prior)
     views = {
         n: _by_markers(n, evidence, correction) for n in set(range(len(evidence.observations))) - set(problem.index)
@@ -237,9 +242,12 @@ def _result(
             covariance = view.covariance + np.outer(motion, motion) + doubt.covariance[place]
             view = dataclasses.replace(view, covariance=covariance)
         views[problem.index[place]] = view
-    # A wrong focal length changes the scale of depth: the print is blamed only where the camera is not.
     causes = [cause.note for cause in (doubt, moment) if cause is not None and cause.note]
-    causes = causes or [print_note(joint, sigma, evidence)]
+    if not causes:
+        causes = [print_note(joint, evidence)]
+    elif moment is None and doubt is not None and doubt.fits:
+        # A wrong focal length changes the scale of depth: what is left beside the explanation is the print's.
+        causes.append(print_note(explained, evidence))
     cluttered = ", ".join(str(o.number) for o in problem.observations if o.is_cluttered)
     clutter = (
         f"what one view alone has on the board, such as a hand, is left out: views {cluttered}" if cluttered else ""
@@ -294,7 +302,12 @@ def _mark_moved(estimate: CaptureEstimate, groups: list[list[int]], settled: boo
     return dataclasses.replace(estimate, views=views, notes=(note, *estimate.notes))
 
 
-def print_note(joint: Joint, sigma: Array, evidence: Evidence) -> str:
+def _sigma_shared(joint: Joint) -> Array:
+    """[S]: of what all views share."""
+    return np.asarray(np.sqrt(np.maximum(np.diag(joint.covariance)[-SHARED:], 0.0)))
+
+
+def print_note(joint: Joint, evidence: Evidence) -> str:
     """Whether print and depth disagree about the scale, which no capture can decide; else what lengths are worth.
 
     Empty where somebody measured the board, or depth is metric truth, and they agree.
@@ -305,7 +318,7 @@ def print_note(joint: Joint, sigma: Array, evidence: Evidence) -> str:
     excess = (1.0 / shared.scale if by_print else shared.print_scale) - 1.0
     is_measured = board.measured_ruler_m is not None
     measure = f"Measure the printed ruler ({1000 * board.ruler_m:g} mm) and write its length into board.json as measured_ruler_m"
-    least = max(SCALES_DIFFER if is_measured else UNMEASURED, SIGNIFICANT * sigma[index])
+    least = max(SCALES_DIFFER if is_measured else UNMEASURED, SIGNIFICANT * _sigma_shared(joint)[index])
     if joint.prior[index] == 0 or abs(excess) < least:
         distance_m = float(np.median(np.linalg.norm(joint.solution.poses[:, :3, 3], axis=1)))
         unsure = f"all lengths are known to about {UNMEASURED:.1%}, {1000 * UNMEASURED * distance_m:.0f} mm at these distances"

@@ -348,7 +348,11 @@ def judge(
         sigma_m, sigma_rad = (math.sqrt(max(0.0, float(np.linalg.eigvalsh(block)[-1]))) for block in blocks)
         if sigma_m > MAX_SIGMA_M or sigma_rad > MAX_SIGMA_RAD:
             sigma = f"{1000 * sigma_m:.1f} mm, {math.degrees(sigma_rad):.2f} degrees"
-            faults.append(f"the pose is uncertain: {sigma} (one sigma)")
+            by_depth = sigma_rad <= MAX_SIGMA_RAD and evidence.spec.trust == "depth"
+            remedy = (
+                ": take more views, or take the print for metric truth (estimation.trust: print)" if by_depth else ""
+            )
+            faults.append(f"the pose is uncertain: {sigma} (one sigma){remedy}")
     if off_px is not None and off_px > MOST_REPROJECTION_PX:
         faults.append(
             f"median reprojection error {off_px:.2f} px, above {MOST_REPROJECTION_PX:g}: "

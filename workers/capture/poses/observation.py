@@ -233,10 +233,15 @@ MOST = 200
 """Patches of one view that are kept, evenly over all that there are."""
 
 
+def side_of_patch(camera: CaptureCamera) -> int:
+    """Pixels across a patch of the object."""
+    return max(ACROSS, round(SIDE_RAD * camera.intrinsics.fx))
+
+
 def object_patches(depth: NDArray[np.uint16], T_board_cam: Pose, on_board: Patches, setup: Setup) -> Patches:
     """The object's patches in one view, at most MOST; heights are over the board's plane as this view's depth has it."""
     board, camera = setup.board, setup.camera
-    side = max(ACROSS, round(SIDE_RAD * camera.intrinsics.fx))
+    side = side_of_patch(camera)
     blocks = _blocks_over_board(T_board_cam, board, camera, side)
     if not len(blocks):
         return no_patches()
