@@ -202,10 +202,9 @@ def _come_to_rest(drop: Drop, flat: bool, forms: Sequence[Form], paces: Sequence
             return dataclasses.replace(ending, poses=rested.poses)
         finer = paces[list(paces).index(pace) + 1 :]
         if drop.single and pace.coarse and finer:
+            # Coarse parts may let it in too deep for exact rest to see, which then goes through the table.
             gap_m, _ = find_gaps_m(placement.forms, (*rested.poses, np.eye(4)))
-            if (
-                gap_m < -DEEPEST_M
-            ):  # coarse parts let it in too deep for exact rest to see, which then goes through the table
+            if gap_m < -DEEPEST_M:
                 paces = finer
                 continue
         pairs = zip(drop.starts, outcome.poses, rested.poses, strict=True)
