@@ -427,9 +427,8 @@ def require_room(name: str, camera: Camera, plan: ScenePlan, things: Sequence[Pl
         if thing.region_id == REGION_FLOOR:
             continue
         T, (low, high) = invert(camera.T_world_cam) @ thing.T_world_shape, thing.shape.bounds
-        if (
-            T[2, 3] + np.minimum(T[2, :3] * low, T[2, :3] * high).sum() > NEAR_M
-        ):  # its whole box is beyond the near plane
+        nearest_m = T[2, 3] + np.minimum(T[2, :3] * low, T[2, :3] * high).sum()
+        if nearest_m > NEAR_M:  # its whole box is beyond the near plane
             continue
         what, point = names[thing.region_id], transform(invert(T), np.zeros((1, 3)))
         if ((point > low) & (point < high)).all() and abs(winding_numbers(point, thing.shape.mesh)[0]) > 0.5:

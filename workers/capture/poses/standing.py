@@ -13,7 +13,7 @@ from schemas.base import Array
 from schemas.errors import CaptureError
 from workers.capture.poses.joint import BoardTerm, gather
 from workers.capture.poses.markers import Evidence
-from workers.capture.poses.observation import Observation
+from workers.capture.poses.observation import SIDE_RAD, Observation
 from workers.capture.poses.terms import SHARED, SIGNIFICANT, Problem, Shared, Solution, minimise
 from workers.geometry.frames import invert, transform
 
@@ -90,7 +90,7 @@ def check_moments(evidence: Evidence) -> None:
 
 # ---------------------------------------------------------------------------------------------- the object
 
-WITHIN_RAD = 0.006
+WITHIN_RAD = SIDE_RAD / 2
 """A point is compared with the patch of another view whose middle is at most half a patch from its direction, this in the usual
 sizes of images: beside the rim of a thin thing the next patch is of what lies behind."""
 ASIDE = 16
