@@ -71,7 +71,7 @@ class Recorded:
     again, and gives frames of colour and depth each in the order of time. `depth` is None where depth is registered to the
     colour camera. Time is microseconds; depth frames are `depth_delay_us` later than the colour frames they belong to;
     `duration_us` is the last time stamp by the file's own word, None where it has none because the recorder was interrupted.
-    `told` goes into recording.json.
+    `told` goes into recording.json; `notes` are sentences for the user.
     """
 
     path: Path
@@ -85,6 +85,7 @@ class Recorded:
     units_per_m: float = 1000.0
     missing: str = ""
     with_units: "Callable[[float], Recorded] | None" = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -268,7 +268,8 @@ def import_recording(
     origin |= {"losses": asdict(losses), "views": [asdict(view) for view in made]}
     (out / RECORDING_FILE).write_text(json.dumps(origin, indent=1) + "\n", encoding="utf-8")
     write_description(out, about, stored, board)
-    return Imported(made, len(pairs), losses, origin["calibration"], (*describe_losses(losses), *notes))
+    notes = [*describe_losses(losses), *recording.notes, *notes]
+    return Imported(made, len(pairs), losses, origin["calibration"], tuple(notes))
 
 
 def _measure(recording: Recorded) -> tuple[Stamps, list[FrameMeasure], Stamps, int]:

@@ -145,25 +145,32 @@ def stamp(us):
     return struct.pack("<II", us // 1_000_000, us % 1_000_000 * 1000)
 
 
-def header(us):
-    return struct.pack("<I", 0) + stamp(us) + block("camera")
+def header(us, frame="camera"):
+    return struct.pack("<I", 0) + stamp(us) + block(frame)
 
 
-def image(us, encoding, pixels):
+def image(us, encoding, pixels, frame="camera"):
     height, width = pixels.shape[:2]
     body = struct.pack("<II", height, width) + block(encoding)
-    return header(us) + body + struct.pack("<BI", 0, pixels.strides[0]) + block(np.ascontiguousarray(pixels).tobytes())
+    return (
+        header(us, frame)
+        + body
+        + struct.pack("<BI", 0, pixels.strides[0])
+        + block(np.ascontiguousarray(pixels).tobytes())
+    )
 
 
-def info(width, height, lens=(0.0,) * 5, model="Brown Conrady", k=(FX, FY, CX, CY)):
-    D = struct.pack(f"<I{len(lens)}d", len(lens), *lens)
+def info(width, height, lens=(0.0,) * 5, model="Brown Conrady", k=(FX, FY, CX, CY), rectified=None):
+    D, p = struct.pack(f"<I{len(lens)}d", len(lens), *lens), rectified or k
     return (
         header(0)
         + struct.pack("<II", height, width)
         + block(model)
         + D
         + struct.pack("<9d", k[0], 0, k[2], 0, k[1], k[3], 0, 0, 1)
-        + struct.pack("<9d12d6IB", *range(21), *range(6), 0)  # R, P, binning and the region of interest
+        + struct.pack("<9d", *range(9))  # R
+        + struct.pack("<12d", p[0], 0, p[2], 0, 0, p[1], p[3], 0, 0, 0, 1, 0)
+        + struct.pack("<6IB", *range(6), 0)  # binning and the region of interest
     )
 
 
@@ -397,6 +404,18 @@ def test_a_folder_without_a_camera_asks_for_one_and_takes_no_one_elses(tmp_path)
     assert imported(bare, tmp_path / "bare_own", fx=66.0)[1].camera.intrinsics.fx == 66.0
 
 
+def test_frames_that_are_numbered_without_zeros_are_in_the_order_of_their_numbers(tmp_path):
+    path = write_open3d(tmp_path)
+    for folder, end in (("color", "jpg"), ("depth", "png")):
+        for n, to in ((2, 10), (1, 9), (0, 1)):
+            (path / folder / f"{n:05d}.{end}").rename(path / folder / f"{to}.{end}")
+        write(path / folder / ".DS_Store", b"Bud1")
+    color, depth = frames_of(open_any(path))
+    for n in range(COUNT):
+        assert np.abs(color[n].load(False).astype(int) - SMOOTH[n]).max() <= JPEG_CODES
+        assert depth[n].load(False) == pytest.approx(DEPTH_MM[n] / 1000)
+
+
 def test_folders_of_other_names_and_grey_pictures_are_read(tmp_path):
     path = write_open3d(tmp_path / "o")
     (path / "color").rename(path / "rgb")
@@ -516,26 +535,95 @@ def test_the_inverse_lens_of_a_realsense_is_where_its_sdk_projects_a_point(tmp_p
     assert np.abs(seen - sdk).max() < 1e-4  # 0.06 pixels of a D455
 
 
-def test_a_drivers_bag_needs_depth_registered_to_colour(tmp_path):
-    def published(depth_topic):
-        said = [
-            ("/camera/color/camera_info", INFO, 0, info(W, H, (0.1, -0.2, 1e-3, 0, 0.05), "plumb_bob")),
-            (f"/camera/{depth_topic}/camera_info", INFO, 0, info(W, H)),
-        ]
-        for n, t in enumerate(STAMPS_US):
-            said.append(("/camera/color/image_raw", IMAGE, t, image(t, "bgr8", SMOOTH[n][..., ::-1])))
-            said.append((f"/camera/{depth_topic}/image_raw", IMAGE, t, image(t, "16UC1", DEPTH_MM[n])))
-        return said
+BENT, P = (0.1, -0.2, 1e-3, 0, 0.05), (58.0, 58.5, 31.0, 23.0)
 
-    recording = open_any(write_bag(tmp_path, published("aligned_depth_to_color")))
+
+def published(streams, late_us=0):
+    """Of a driver: images by topic, (encoding, pictures, frame), and the `camera_info` beside each; depth is stored later."""
+    said = []
+    for topic, (encoding, pictures, frame) in streams.items():
+        k = (FX, FY, CX, CY) if "color" in frame else (50.0, 50.0, 30.0, 24.0)
+        place = topic.rpartition("/")[0]
+        said.append(
+            (f"{place}/camera_info", INFO, 0, info(W, H, BENT, "plumb_bob", k, P if "color" in frame else None))
+        )
+        for n, t in enumerate(STAMPS_US):
+            stored = t + late_us * ("depth" in topic)
+            said.append((topic, IMAGE, stored, image(t, encoding, pictures[n], frame)))
+    return sorted(said, key=lambda message: message[2])
+
+
+BGR = [np.ascontiguousarray(rgb[..., ::-1]) for rgb in SMOOTH]
+BGRA = [np.dstack([bgr, bgr[..., 0]]) for bgr in BGR]
+OTHER = [255 - bgra for bgra in BGRA]
+DEPTH_M = [(mm / 1000).astype(np.float32) for mm in DEPTH_MM]
+DRIVERS = {
+    "realsense": {
+        "/camera/color/image_raw": ("bgr8", BGR, "color"),
+        "/camera/depth/image_rect_raw": ("16UC1", DEPTH_MM[::-1], "depth"),
+        "/camera/aligned_depth_to_color/image_raw": ("16UC1", DEPTH_MM, "aligned_to_color"),
+        "/camera/infra1/image_rect_raw": ("mono8", DEPTH_MM, "depth"),
+    },
+    "azure": {
+        "/ir/image_raw": ("mono16", DEPTH_MM[::-1], "depth"),
+        "/depth/image_raw": ("16UC1", DEPTH_MM[::-1], "depth"),
+        "/rgb_to_depth/image_raw": ("bgra8", OTHER, "depth"),
+        "/depth_to_rgb/image_raw": ("32FC1", DEPTH_M, "color"),
+        "/rgb/image_raw": ("bgra8", BGRA, "color"),
+    },
+    "two": {
+        "/a/color/image_raw": ("bgr8", BGR, "a_color"),
+        "/b/color/image_raw": ("bgra8", OTHER, "b_color"),
+        "/b/aligned_depth_to_color/image_raw": ("16UC1", DEPTH_MM[::-1], "b_color"),
+        "/a/aligned_depth_to_color/image_raw": ("16UC1", DEPTH_MM, "a_color"),
+    },
+}
+"""Topics of the drivers realsense-ros and Azure_Kinect_ROS_Driver, and of two cameras of the first."""
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_of_a_drivers_bag_colour_is_taken_with_the_depth_registered_to_it(driver, tmp_path):
+    recording = open_any(write_bag(tmp_path, published(DRIVERS[driver])))
     color, depth = frames_of(recording)
-    assert recording.depth is None and recording.color.lens.tolist() == [0.1, -0.2, 1e-3, 0, 0.05, 0, 0, 0]
-    assert np.array_equal(color[1].load(False), SMOOTH[1]) and depth[1].load(False) == pytest.approx(DEPTH_MM[1] / 1000)
-    with pytest.raises(CaptureError, match="record the topic aligned_depth_to_color"):
-        open_any(write_bag(tmp_path, published("depth")))
-    bare = write_bag(
-        tmp_path, [said for said in published("aligned_depth_to_color") if "color/camera_info" not in said[0]]
-    )
+    assert recording.depth is None and recording.color.lens.tolist() == [*BENT, 0, 0, 0]
+    for n in range(COUNT):
+        assert np.array_equal(color[n].load(False), SMOOTH[n])
+        assert depth[n].load(False) == pytest.approx(DEPTH_MM[n] / 1000)
+    assert ("/b/color/image_raw" in " ".join(recording.notes)) == (driver == "two")
+
+
+def test_images_are_of_the_time_they_were_taken_not_stored(tmp_path):
+    streams = {name: DRIVERS["realsense"][name] for name in list(DRIVERS["realsense"])[::2]}
+    color, depth = frames_of(open_any(write_bag(tmp_path, published(streams, late_us=40_000))))
+    assert [frame.stamp_us for frame in color] == [frame.stamp_us for frame in depth] == STAMPS_US
+    said = realsense()  # of the SDK without a common clock: its images say nothing that joins them
+    lost = [(*m[:3], image(m[2] - STAMPS_US[0], "mono16", DEPTH_MM[0])) if "Depth_0/image" in m[0] else m for m in said]
+    color, depth = frames_of(open_any(write_bag(tmp_path, lost)))
+    assert [frame.stamp_us - 900 for frame in color] == [frame.stamp_us for frame in depth] == STAMPS_US
+
+
+def test_a_rectified_image_has_the_camera_of_its_projection_matrix_and_no_lens(tmp_path):
+    streams = {
+        "/camera/rgb/image_rect_color": ("bgr8", BGR, "color"),
+        "/camera/depth_registered/hw_registered/image_rect": ("16UC1", DEPTH_MM, "color"),
+    }
+    recording = open_any(write_bag(tmp_path, published(streams)))
+    assert recording.depth is None and not recording.color.has_lens
+    assert k_of(frames_of(recording)[0][0], recording) == [P[0], P[1], P[2] + 0.5, P[3] + 0.5]
+    raw = open_any(write_bag(tmp_path, published({"/camera/rgb/image_raw": ("bgr8", BGR, "color")} | streams)))
+    assert not raw.color.has_lens, "depth is rectified as well"
+    del streams["/camera/rgb/image_rect_color"]
+    raw = open_any(write_bag(tmp_path, published({"/camera/rgb/image_raw": ("bgr8", BGR, "color")} | streams)))
+    assert raw.color.has_lens and not raw.depth.lens.any() and raw.depth.intrinsics.fx == P[0]
+    assert np.array_equal(raw.depth.T_color_depth, np.eye(4))
+
+
+def test_a_drivers_bag_needs_depth_registered_to_colour(tmp_path):
+    color, raw, aligned, _ = DRIVERS["realsense"]
+    with pytest.raises(CaptureError, match="aligned_depth_to_color of a RealSense or depth_to_rgb of an Azure Kinect"):
+        open_any(write_bag(tmp_path, published({name: DRIVERS["realsense"][name] for name in (color, raw)})))
+    said = published({name: DRIVERS["realsense"][name] for name in (color, aligned)})
+    bare = write_bag(tmp_path, [message for message in said if "color/camera_info" not in message[0]])
     with pytest.raises(CaptureError, match="no camera_info for /camera/color/image_raw: describe it in a camera"):
         imported(bare, tmp_path / "no")
     assert np.array_equal(read_view(imported(bare, tmp_path / "given", fx=70.0)[1], 2).rgb, SMOOTH[2])

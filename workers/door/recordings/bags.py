@@ -1,178 +1,33 @@
-"""ROS bags of a RealSense, by the library rosbags: its SDK's, and those of its ROS drivers with depth registered to colour.
+"""ROS bags of a RealSense or an Azure Kinect: the SDK's, and those of ROS drivers with depth registered to colour.
 
-Of ROS 1 a .bag, of ROS 2 a .db3, a .mcap, or the folder that holds them. Few kinds of messages are read, by their published
-definitions; those in a bag are a stranger's, and would be compiled. What the topics mean is in the SDK's sources:
-/device_0/sensor_N/Depth_0/image/data, .../info/camera_info, .../tf/0 (a transform that takes coordinates of the reference
-stream to the stream's), .../option/Depth_Units/value. The SDK's .db3 has texts in place of all but images: .../camera_info
-"width=...;ppx=...;model=...;coeffs=...", .../tf/ref_0 "rotation=(column by column);translation=..."; and each message may be
-compressed by itself.
+What the topics of the SDK mean is in its sources: /device_0/sensor_N/Depth_0/image/data, .../info/camera_info, .../tf/0 (a
+transform that takes coordinates of the reference stream to the stream's), .../option/Depth_Units/value. Its .db3 has texts in
+place of all but images: .../camera_info "width=...;ppx=...;model=...;coeffs=...", .../tf/ref_0 "rotation=(column by
+column);translation=...". Drivers have a camera_info beside each topic of images.
 """
 
-import bz2
-import heapq
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
-from functools import cache, partial
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import cv2
-import lz4.frame
 import numpy as np
-from backports import zstd
 from numpy.typing import NDArray
-from rosbags.rosbag1 import reader as bag
-from rosbags.rosbag2 import storage_mcap as mcap
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
-from rosbags.typesys import Stores, get_typestore
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.capture import CaptureCamera, DepthCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.scene.view import Intrinsics
-from workers.door.opening import as_refusal, open_file
+from workers.door.opening import as_refusal
+from workers.door.recordings.bag_files import IMAGE, INFO, TRANSFORM, BagMessage, open_files, read_messages
 from workers.door.recordings.pictures import read_intrinsics
 from workers.geometry.frames import invert, pose, rotation_from_quaternion
 
-MOST_BYTES = 512_000_000
-"""Of one chunk, unpacked."""
-
 LONGEST_SIDE = 20_000
 """Of an image, pixels."""
-
-IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
-TRANSFORM, FLOAT, TEXT = "geometry_msgs/msg/Transform", "std_msgs/msg/Float32", "std_msgs/msg/String"
-
-ZSTD = b"\x28\xb5\x2f\xfd"
-"""First bytes of a message of ROS 2 that is compressed."""
-
-
-@dataclass(frozen=True)
-class _Kind:
-    """A format of bags: what opens a file, the method and the definitions that decode messages, what mends one that was cut."""
-
-    open: Callable[[Path], Any]
-    method: str
-    store: Stores
-    remedy: str
-
-    def decode(self, data: bytes, kind: str) -> Any:
-        """The message with its fields."""
-        if data.startswith(ZSTD):
-            data = _unpack(zstd.ZstdDecompressor, data)
-        return getattr(_definitions(self.store), self.method)(data, kind)
-
-
-_definitions = cache(get_typestore)
-
-KINDS = {
-    b"#ROSBAG V2.0\n": _Kind(
-        bag.Reader, "deserialize_ros1", Stores.ROS1_NOETIC, "`rosbag reindex FILE` mends a bag that was cut"
-    ),
-    b"SQLite format 3\0": _Kind(  # the library puts the path into a URI
-        lambda path: Sqlite3Reader(Path(quote(str(path)))),
-        *("deserialize_cdr", Stores.ROS2_HUMBLE, "`ros2 bag reindex FOLDER` mends a bag that was cut"),
-    ),
-    b"\x89MCAP0\r\n": _Kind(
-        mcap.McapReader, "deserialize_cdr", Stores.ROS2_HUMBLE, "`mcap recover FILE` mends a bag that was cut"
-    ),
-}
-"""Formats of bags by their first bytes."""
-
-
-def _unpack(open_decompressor: Callable[[], Any], data: bytes, *_: int) -> bytes:
-    """What a chunk holds, up to `MOST_BYTES`."""
-    decompressor = open_decompressor()
-    unpacked: bytes = decompressor.decompress(data, MOST_BYTES)
-    if not decompressor.eof:
-        raise ValueError(f"a chunk is cut, or unpacks to more than {MOST_BYTES // 1_000_000} MB")
-    return unpacked
-
-
-# The library unpacks whatever a few bytes stand for.
-bag.decompressors |= {
-    "bz2": partial(_unpack, bz2.BZ2Decompressor),
-    "lz4": partial(_unpack, lz4.frame.LZ4FrameDecompressor),
-}
-mcap.DECOMPRESSORS |= {
-    "lz4": partial(_unpack, lz4.frame.LZ4FrameDecompressor),
-    "zstd": partial(_unpack, zstd.ZstdDecompressor),
-}
-
-
-def _kind_of(path: Path) -> _Kind | None:
-    with open_file(path, CaptureError) as stream:
-        head = stream.read(16)
-    return next((kind for start, kind in KINDS.items() if head.startswith(start)), None)
-
-
-def _files(path: Path) -> list[Path]:
-    """The files of a bag: itself, or those in its folder by name."""
-    if not path.is_dir():
-        return [path]
-    if packed := next((file for file in path.iterdir() if file.name.endswith((".db3.zstd", ".mcap.zstd"))), None):
-        raise CaptureError("format", f"{packed} is compressed: unpack it (zstd -d FILE), and import what comes out")
-    return sorted(file for file in path.iterdir() if file.suffix in (".db3", ".mcap"))
-
-
-def is_bag(path: Path) -> bool:
-    """Whether a path is a ROS bag, by the first bytes of a file, or of a folder by the file that describes it."""
-    return (path / "metadata.yaml").is_file() if path.is_dir() else _kind_of(path) is not None
-
-
-@dataclass(frozen=True)
-class _Message:
-    """A message as stored; `content` decodes it."""
-
-    topic: str
-    kind: str
-    stamp_us: int
-    content: Callable[[], Any]
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[list[tuple[_Kind, Any]]]:
-    """The files of a bag, open. Raises CaptureError, with the command that mends it, whatever the library raises meanwhile."""
-    with ExitStack() as stack:
-        readers = []
-        for file in _files(path):
-            if (kind := _kind_of(file)) is None:
-                raise CaptureError("unreadable", f"{file} is no bag: copy it again")
-            stack.enter_context(as_refusal(file, CaptureError, kind.remedy))
-            reader = kind.open(file)
-            reader.open()
-            stack.callback(reader.close)
-            readers.append((kind, reader))
-        yield readers
-
-
-def _messages(path: Path) -> Iterator[_Message]:
-    """The messages of the kinds that are read, in the order of time."""
-    with _opened(path) as readers:
-        yield from heapq.merge(*(_of_file(*pair) for pair in readers), key=lambda message: message.stamp_us)
-
-
-def _part(topic: str, kind: str) -> str:
-    """What a topic of a type is about: the type of its message in ROS 1; "" for what is not needed."""
-    if kind in (TEXT, INFO) and topic.endswith("/camera_info"):
-        return INFO
-    if kind in (TEXT, TRANSFORM) and "/tf/" in topic:
-        return TRANSFORM
-    if kind in (TEXT, FLOAT) and topic.replace("_", " ").endswith("/option/Depth Units/value"):
-        return FLOAT
-    return IMAGE if kind == IMAGE else ""
-
-
-def _of_file(kind: _Kind, reader: Any) -> Iterator[_Message]:
-    wanted = [connection for connection in reader.connections if _part(connection.topic, connection.msgtype)]
-    for connection, stamp_ns, data in reader.messages(wanted) if wanted else ():
-        content = partial(kind.decode, bytes(data), connection.msgtype)
-        yield _Message(connection.topic, _part(connection.topic, connection.msgtype), stamp_ns // 1000, content)
-
-
-# ---------------------------------------------------------------------------------------------- messages
 
 COLORS = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
 PACKED = {
@@ -199,12 +54,22 @@ def _pixels(image: Any) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class _Info:
-    """Of a CameraInfo: size (width, height), K [3, 3], D, and the model of the lens."""
+    """Of a CameraInfo: size (width, height), K [3, 3], D, and the model of the lens; P [3, 3] is of the rectified image."""
 
     size: tuple[int, int]
     K: Array
     D: Array
     model: str
+    P: Array | None = None
+
+    def is_like(self, other: "_Info") -> bool:
+        """Whether it is of the same image, whatever the lens."""
+        return self.size == other.size and bool(np.allclose(self.K, other.K, rtol=1e-6))
+
+    @property
+    def rectified(self) -> "_Info":
+        """Of the images that image_proc and drivers call image_rect: REP 104 has their camera in P."""
+        return self if self.P is None or not self.P[0, 0] > 0.0 else replace(self, K=self.P, D=np.zeros(0), P=None)
 
 
 def _fields(text: str) -> dict[str, Any]:
@@ -219,8 +84,9 @@ def _info(content: Any) -> _Info:
         width, height, fx, fy, cx, cy = (said[name].item() for name in ("width", "height", "fx", "fy", "ppx", "ppy"))
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         return _Info((int(width), int(height)), K, said["coeffs"], said["model"])
-    K, D = (content.K, content.D) if hasattr(content, "K") else (content.k, content.d)
-    return _Info((content.width, content.height), np.reshape(K, (3, 3)), np.asarray(D), content.distortion_model)
+    K, D, P = (content.K, content.D, content.P) if hasattr(content, "K") else (content.k, content.d, content.p)
+    size, P = (content.width, content.height), np.reshape(P, (3, 4))[:, :3]
+    return _Info(size, np.reshape(K, (3, 3)), np.asarray(D), content.distortion_model, P)
 
 
 def _transform(content: Any) -> Pose:
@@ -243,38 +109,67 @@ def _transform(content: Any) -> Pose:
 
 @dataclass
 class _Stream:
-    """One of the two streams: the topic of its images, their encoding, and what is told of its camera."""
+    """The images of a topic: their encoding, the frame of their coordinates, their times, and what is told of their camera.
 
-    topic: str = ""
+    stamped_us: when each was taken; stored_us: when it came to the recorder.
+    """
+
+    topic: str
     encoding: str = ""
+    frame: str = ""
+    stored_us: list[int] = field(default_factory=list)
+    stamped_us: list[int] = field(default_factory=list)
     info: _Info | None = None
     T_stream_ref: Pose | None = None
     reference: str = ""
 
     @property
-    def is_registered(self) -> bool:
-        """Of depth, whether it is in the image of the colour camera."""
-        return "aligned_depth" in self.topic or "/depth_registered/" in self.topic
+    def is_rectified(self) -> bool:
+        """Whether image_proc, or a driver that does the same, has taken the lens out."""
+        return "rect" in self.topic.rpartition("/")[2]
+
+    @property
+    def is_color(self) -> bool:
+        """Whether its encoding has colours."""
+        return self.encoding in COLORS or self.encoding in PACKED
+
+    @property
+    def is_depth(self) -> bool:
+        """Whether its encoding is one of depth, and not named as what else has it: infrared has mono16."""
+        said = "depth" in self.topic.lower() and not self.is_color
+        return said or (self.encoding in DEPTHS and self.encoding != "mono16")
+
+    def is_registered_to(self, color: "_Stream") -> bool:
+        """Of depth, whether it is in the image of this colour camera: by its name, or by the frame and the camera (REP 118)."""
+        if "aligned_depth" in self.topic or "/depth_registered/" in self.topic:
+            return self.topic.split("/")[1] == color.topic.split("/")[1]
+        is_same = self.info is not None and color.info is not None and self.info.is_like(color.info)
+        return is_same and bool(self.frame) and self.frame == color.frame and not self.topic.startswith(SDK)
+
+
+SDK = "/device_"
+"""First part of the topics of the SDK, where `frame_id` says nothing."""
+
+OTHERS = ("infra", "confidence", "fisheye", "/ir/", "body_index")
+"""Of topics of images that are neither colour nor depth."""
 
 
 @dataclass
 class _Contents:
-    color: _Stream = field(default_factory=_Stream)
-    depth: _Stream = field(default_factory=_Stream)
+    streams: dict[str, _Stream] = field(default_factory=dict)
     units_per_m: float = 1000.0
-    stamps_us: dict[str, list[int]] = field(default_factory=dict)
     infos: dict[str, _Info] = field(default_factory=dict)
     transforms: dict[str, Pose] = field(default_factory=dict)
 
-    def take(self, message: _Message) -> None:
-        """Learns what a message says of cameras and streams; of an image no more than its time, once its stream is known."""
+    def take(self, message: BagMessage) -> None:
+        """Learns what a message says of cameras and streams; of an image no more than its times, once its stream is known."""
         topic = message.topic
         if message.kind == IMAGE:
-            stream = self.depth if "depth" in topic.lower() else self.color
-            better = not stream.topic or (not stream.is_registered and _Stream(topic).is_registered)
-            if better and not any(word in topic.lower() for word in ("infra", "confidence", "fisheye")):
-                stream.topic, stream.encoding = topic, message.content().encoding
-            self.stamps_us.setdefault(topic, []).append(message.stamp_us)
+            if not any(word in topic.lower() for word in OTHERS):
+                image = message.content()
+                stream = self.streams.setdefault(topic, _Stream(topic, image.encoding, image.header.frame_id))
+                stream.stored_us.append(message.stamp_us)
+                stream.stamped_us.append(_stamped_us(image))
         elif message.kind == INFO:
             self.infos[topic.removesuffix("/camera_info").removesuffix("/info")] = _info(message.content())
         elif message.kind == TRANSFORM:
@@ -284,73 +179,120 @@ class _Contents:
             if 1e-6 <= metres <= 0.01:
                 self.units_per_m = round(1.0 / metres, 3)
 
+    def describe(self) -> None:
+        """Gives each stream what is told of its camera."""
+        for topic, stream in self.streams.items():
+            base = topic.removesuffix("/image/data") if topic.startswith(SDK) else topic.rpartition("/")[0]
+            info = self.infos.get(base)
+            stream.info = info.rectified if info and stream.is_rectified else info
+            place = next((name for name in self.transforms if name.startswith(f"{base}/tf/")), None)
+            if place:
+                stream.T_stream_ref, stream.reference = self.transforms[place], place.rpartition("/")[2]
+
+
+def _stamped_us(image: Any) -> int:
+    stamp = image.header.stamp
+    return int(stamp.sec) * 1_000_000 + int(stamp.nanosec) // 1000
+
 
 def open_bag(path: Path) -> Recorded:
     """The recording of a bag. Raises CaptureError that says what it holds and what is missing."""
     contents = _Contents()
-    for message in _messages(path):
+    for message in read_messages(path):
         with suppress(CaptureError), as_refusal(message.topic, CaptureError):  # a damaged message is passed over
             contents.take(message)
-    for stream in (contents.color, contents.depth):
-        base = _base(stream.topic)
-        stream.info = contents.infos.get(base)
-        place = next((topic for topic in contents.transforms if topic.startswith(f"{base}/tf/")), None)
-        if place:
-            stream.T_stream_ref, stream.reference = contents.transforms[place], place.rpartition("/")[2]
-    _check(path, contents)
-    color, depth = _cameras(path, contents)
-    stamps = contents.stamps_us[contents.color.topic]
+    contents.describe()
+    color, depth, others = _pair(path, contents)
+    color_camera, depth_camera = _cameras(path, color, depth, contents.units_per_m)
+    is_stamped = _are_stamped(color, depth)
+    stamps = sorted(color.stamped_us if is_stamped else color.stored_us)
     period = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 33_333.0
 
     def frames() -> Iterator[RecordedFrame]:
-        for message in _messages(path):
-            if message.topic in (contents.color.topic, contents.depth.topic):
-                is_depth = message.topic == contents.depth.topic
-                yield RecordedFrame(is_depth, message.stamp_us, partial(_load, message, is_depth, contents))
+        for message in read_messages(path):
+            if message.topic in (color.topic, depth.topic):
+                stream, stamp_us = depth if message.topic == depth.topic else color, message.stamp_us
+                if is_stamped:
+                    with suppress(CaptureError), as_refusal(message.topic, CaptureError):
+                        stamp_us = _stamped_us(message.content())
+                load = partial(_load, message, stream, contents.units_per_m)
+                yield RecordedFrame(stream is depth, stamp_us, load)
 
-    clock, topic = (max(period, 1.0), frames, float(stamps[-1])), contents.color.topic
-    return Recorded(path, color, depth, *clock, told={"topic": topic}, missing=f"it has no camera_info for {topic}")
+    clock = max(period, 1.0), frames, float(stamps[-1])
+    notes = (f"{color.topic} is taken with {depth.topic}, and {', '.join(others)} left out",) if others else ()
+    told, missing = {"topic": color.topic}, f"it has no camera_info for {color.topic}"
+    return Recorded(path, color_camera, depth_camera, *clock, told=told, missing=missing, notes=notes)
 
 
-def _base(topic: str) -> str:
-    """The topic of a stream without what it says of the image: /device_0/sensor_1/Color_0, /camera/color."""
-    return topic.removesuffix("/image/data").rpartition("/image_")[0] or topic.removesuffix("/image/data")
+def _are_stamped(color: _Stream, depth: _Stream) -> bool:
+    """Whether both streams say when their images were taken, by one clock: depth is then near most of colour.
+
+    A recorder stores what comes when it comes: registered depth some tens of milliseconds after its colour image.
+    """
+    c, d = (np.array(sorted(stream.stamped_us), np.int64) for stream in (color, depth))
+    if len(np.unique(c)) < max(2, 0.9 * len(c)):
+        return False
+    at = np.searchsorted(d, c).clip(1, len(d) - 1) if len(d) > 1 else np.zeros(len(c), int)
+    gaps = np.minimum(np.abs(d[at] - c), np.abs(d[at - 1] - c))
+    return bool(np.median(gaps) < 0.5 * np.median(np.diff(c)))
 
 
-def _check(path: Path, contents: _Contents) -> None:
-    """Raises CaptureError where a stream, its encoding or what is told of its camera is not what can be used."""
-    for name, stream in (("colour", contents.color), ("depth", contents.depth)):
-        if not stream.topic:
-            with _opened(path) as readers:
+def _pair(path: Path, contents: _Contents) -> tuple[_Stream, _Stream, list[str]]:
+    """The streams of colour and depth that belong together, and the topics of other cameras' colour.
+
+    Raises CaptureError where there is none, its encoding is none that can be used, or nothing is told of its camera.
+    """
+    depths = [stream for stream in contents.streams.values() if stream.is_depth]
+    colors = [stream for stream in contents.streams.values() if stream.is_color]
+    colors = colors or [stream for stream in contents.streams.values() if not stream.is_depth]
+    for name, streams in (("colour", colors), ("depth", depths)):
+        if not streams:
+            with open_files(path) as readers:
                 kinds = {each.topic: each.msgtype for _, reader in readers for each in reader.connections}
             packed = any("CompressedImage" in kind for kind in kinds.values())
             why = "its images are compressed: convert them (rosrun image_transport republish compressed raw)"
             topics = ", ".join(sorted(topic for topic, kind in kinds.items() if "Image" in kind))
             more = why if packed else f"it has {topics or 'no topic of images'}"
             raise CaptureError(name, f"{path} has no images of {name}; {more}")
+
+    def rank(pair: tuple[_Stream, _Stream]) -> tuple[bool, bool, int]:
+        color, depth = pair
+        is_other = "depth" in color.topic or color.is_rectified != depth.is_rectified
+        shared = [a == b for a, b in zip(color.topic.split("/"), depth.topic.split("/"), strict=False)]
+        return not depth.is_registered_to(color), is_other, -[*shared, False].index(False)
+
+    color, depth = min(((color, depth) for color in colors for depth in depths), key=rank)
+    is_registered = depth.is_registered_to(color)
+    for name, stream in (("colour", color), ("depth", depth)):
         usable = (*COLORS, *PACKED) if name == "colour" else tuple(DEPTHS)
         if stream.encoding not in usable:
             wanted = f"not one of {', '.join(usable)}: record it as one of those"
             raise CaptureError("format", f"{path}: {name} is {stream.encoding!r:.60}, {wanted}")
-        if stream.info is None and not contents.depth.is_registered:
+        if stream.info is None and not is_registered:
             raise CaptureError("calibration", f"{path} has no camera_info for {stream.topic}: record it as well")
+    return color, depth, sorted({stream.topic for stream in colors if stream.frame != color.frame} - {color.topic})
 
 
-def _cameras(path: Path, contents: _Contents) -> tuple[CaptureCamera | None, DepthCamera | None]:
-    color, depth = contents.color, contents.depth
+def _cameras(
+    path: Path, color: _Stream, depth: _Stream, units_per_m: float
+) -> tuple[CaptureCamera | None, DepthCamera | None]:
     if color.info is None:
         return None, None
-    units_per_m = contents.units_per_m if contents.units_per_m <= 10_000 else 1000.0
+    units_per_m = units_per_m if units_per_m <= 10_000 else 1000.0
     camera = CaptureCamera(_intrinsics(path, color.info), _lens(path, color.info), units_per_m)
-    if depth.is_registered or depth.info is None:
-        return camera, None
-    if color.T_stream_ref is None or depth.T_stream_ref is None or color.reference != depth.reference:
+    T_color_depth = np.eye(4)
+    if depth.is_registered_to(color):
+        if depth.info is None or (depth.info.is_like(color.info) and depth.is_rectified == color.is_rectified):
+            return camera, None
+    elif color.T_stream_ref is None or depth.T_stream_ref is None or color.reference != depth.reference:
         raise CaptureError(
             "calibration",
-            f"{path} does not say where the depth camera is beside the colour camera: record the topic "
-            "aligned_depth_to_color, or with the RealSense Viewer",
+            f"{path} does not say where the depth camera is beside the colour camera: record depth registered to colour, "
+            "the topic aligned_depth_to_color of a RealSense or depth_to_rgb of an Azure Kinect, or with the RealSense Viewer",
         )
-    T_color_depth = color.T_stream_ref @ invert(depth.T_stream_ref)
+    else:
+        T_color_depth = color.T_stream_ref @ invert(depth.T_stream_ref)
+    assert depth.info is not None  # _pair refuses it
     return camera, DepthCamera(_intrinsics(path, depth.info), _lens(path, depth.info), frozen_array(T_color_depth))
 
 
@@ -372,9 +314,8 @@ def _lens(path: Path, info: _Info) -> Array:
     return frozen_array(np.append(info.D[:8], np.zeros(8))[:8])
 
 
-def _load(message: _Message, is_depth: bool, contents: _Contents, small: bool) -> NDArray | None:
+def _load(message: BagMessage, stream: _Stream, units_per_m: float, small: bool) -> NDArray | None:
     """As `RecordedFrame.load`."""
-    stream = contents.depth if is_depth else contents.color
     image = pixels = None
     with suppress(CaptureError), as_refusal(message.topic, CaptureError):
         image = message.content()
@@ -383,8 +324,8 @@ def _load(message: _Message, is_depth: bool, contents: _Contents, small: bool) -
         return None
     if stream.info is not None and pixels.shape[1::-1] != stream.info.size:
         return None
-    if is_depth:
-        scale = contents.units_per_m if image.encoding != "32FC1" else 1.0
+    if not stream.is_color:
+        scale = units_per_m if image.encoding != "32FC1" else 1.0
         depth = np.nan_to_num(pixels.astype(np.float64) / scale, nan=0.0, posinf=0.0, neginf=0.0)
         return depth if not small else np.zeros(0)
     conversion = {**COLORS, **PACKED}[image.encoding]

@@ -24,7 +24,8 @@ from schemas.capture import CaptureCamera, Recorded, RecordedFrame
 from schemas.errors import CaptureError
 from schemas.scene.view import Intrinsics
 from workers.door.opening import as_refusal, open_file, read_bytes
-from workers.door.recordings.bags import is_bag, open_bag
+from workers.door.recordings.bag_files import is_bag
+from workers.door.recordings.bags import open_bag
 from workers.door.recordings.kinect import is_kinect, open_kinect
 from workers.door.recordings.pictures import (
     Size,
@@ -217,6 +218,12 @@ def _open3d_folder(path: Path) -> Path | None:
     return color if (path / "depth").is_dir() else None
 
 
+def _images_in(folder: Path) -> list[Path]:
+    """Its files in the order of the numbers in their names, 9 before 10, without those that systems leave in every folder."""
+    files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith((".", "Thumbs.db"))]
+    return sorted(files, key=lambda file: re.sub(r"[0-9]+", lambda number: number[0].zfill(20), file.name))
+
+
 def _open3d_camera(path: Path, size: Size) -> tuple[Seen, str]:
     """The camera of images of a size by Open3D's file, or what is missing. A camera.json may be one of ours."""
     for described in (path / name for name in OPEN3D_FILES if (path / name).is_file()):
@@ -234,7 +241,7 @@ def _open3d_camera(path: Path, size: Size) -> tuple[Seen, str]:
 
 def _open_open3d(path: Path, units_per_m: float = UNITS_PER_M) -> Recorded:
     folder = _open3d_folder(path) or path
-    color, depth = (sorted(f for f in each.iterdir() if f.is_file()) for each in (folder, path / "depth"))
+    color, depth = _images_in(folder), _images_in(path / "depth")
     if not color or [file.stem for file in color] != [file.stem for file in depth]:
         counts = f"{len(color)} images in {folder.name}/ and {len(depth)} in depth/"
         raise CaptureError("counts", f"{path} has {counts}, or of other names")
@@ -362,7 +369,7 @@ def _has(path: Path, *names: str) -> bool:
 
 READERS = (
     Reader("an Azure Kinect recording (.mkv)", is_kinect, open_kinect),
-    Reader("a ROS bag of a RealSense (.bag, .db3, .mcap)", is_bag, open_bag),
+    Reader("a ROS bag of a RealSense or an Azure Kinect (.bag, .db3, .mcap)", is_bag, open_bag),
     Reader("a TUM RGB-D folder (rgb.txt, depth.txt)", lambda path: _has(path, "rgb.txt", "depth.txt"), _open_tum),
     Reader("a BOP scene (scene_camera.json, rgb/ or gray/, depth/)", lambda path: _has(path, BOP_FILE), _open_bop),
     Reader("an Open3D folder (color/ or rgb/, depth/)", lambda path: bool(_open3d_folder(path)), _open_open3d),
