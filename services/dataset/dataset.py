@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -262,6 +262,10 @@ class RangeRows:
         return int(self.pairs.nbytes + self.more.nbytes + self.objects.nbytes + self.assets.nbytes)
 
 
+_TOGETHER: Final = 16
+"""Rows that become Python's objects together: in a sixth of the time that each takes by itself, and one scene keeps no more."""
+
+
 def pairs_of(rows: RangeRows, files: Files, where: pc.Expression | None = None) -> Iterator[Pair]:
     """The pairs of some scenes for which `where` is true, by pose id."""
     table = choose_pairs(rows.pairs, where)
@@ -276,8 +280,9 @@ def pairs_of(rows: RangeRows, files: Files, where: pc.Expression | None = None) 
     for row in chosen.to_pylist():
         name = view_name(row["role"], row["number"])
         labels[row["pose_id"], name].append(row | {"asset": assets[row["instance_id"]]})
-    for number in np.argsort(table.column("parent_id").to_numpy()):
-        row = table.slice(number, 1).to_pylist()[0]
+    order = np.argsort(table.column("parent_id").to_numpy())
+    table = table if (np.diff(order) == 1).all() else table.take(order)  # which copies all columns
+    for row in (row for part in table.to_batches(max_chunksize=_TOGETHER) for row in part.to_pylist()):
         further = rows.more.filter(pc.field("parent_id") == row["parent_id"]).to_pylist() if len(rows.more) else ()
         yield read_pair(row, labels, files, further)
 

@@ -170,10 +170,12 @@ BLOCK: Final = 8192
 def _sums_of(d: Array, t: Array, worst_m: float) -> Array:
     """The sums over pixels that `METRICS` are means of, squares in place of their root, of predicted and true depth [N]."""
     count = len(t)
-    hit = (d > 0.0) & (d < np.inf)
-    holes = count - np.count_nonzero(hit)
-    if holes:  # a hole is as far off as any, and beyond all ratios
+    if not (
+        d.min(initial=1.0) > 0.0 and d.max(initial=1.0) < np.inf
+    ):  # a hole is as far off as any, and beyond all ratios
+        hit = (d > 0.0) & (d < np.inf)
         d, t = d[hit], t[hit]
+    holes = count - len(t)
     larger, smaller = np.maximum(d, t), np.minimum(d, t)
     apart = larger - smaller
     error = np.minimum(apart, worst_m)
@@ -181,7 +183,10 @@ def _sums_of(d: Array, t: Array, worst_m: float) -> Array:
     sums = [error.sum() + holes * worst_m, error @ error + holes * worst_m**2, np.minimum(apart / t, 1.0).sum() + holes]
     sums.append(len(near) - near.sum() / AUC_M)
     sums += [np.count_nonzero(apart <= limit_m + SLACK_M) for limit_m in (0.001, 0.002, 0.005, 0.01)]
-    sums += [np.count_nonzero(larger < 1.25**power * smaller - SLACK_M) for power in (1, 2, 3)]
+    if apart.max(initial=0.0) < 0.25 * smaller.min(initial=np.inf) - SLACK_M:  # of most blocks, at a sixth of the time
+        sums += [len(t)] * 3
+    else:
+        sums += [np.count_nonzero(larger < 1.25**power * smaller - SLACK_M) for power in (1, 2, 3)]
     return np.array([*sums, holes, count], np.float64)
 
 
@@ -200,8 +205,10 @@ def align_depth(predicted_m: Array, true_m: Array, how: Alignment) -> Array:
     `scale`: the median of true by predicted depth (Zhou et al. 2017, section 4.1). `similarity`: factor and offset of least
     squares (Ranftl et al. 2020, eq. 4, there of disparity). Over all pixels with both; as it is where there are none.
     """
+    if how == "none":
+        return predicted_m
     both = (predicted_m > 0.0) & (true_m > 0.0) & np.isfinite(predicted_m)
-    if how == "none" or not both.any():
+    if not both.any():
         return predicted_m
     d, t = predicted_m[both], true_m[both]
     factor, offset_m = float(np.median(t / d)), 0.0

@@ -300,8 +300,10 @@ def check_depth(predicted_m: Array, true_m: Array, units_per_m: float | None, ma
     if np.count_nonzero(both) < LEAST_PIXELS:
         return
     predicted, true = predicted[both], true[both]
-    both = mask & (predicted_m > 0.0) & (true_m > 0.0)
-    likeness = max(correlation(predicted, true), correlation(predicted_m[both], true_m[both]) if both.any() else -1.0)
+    at = np.flatnonzero(mask)
+    objects, likeness = np.stack([predicted_m.ravel()[at], true_m.ravel()[at]]), correlation(predicted, true)
+    objects = objects[:, (objects > 0.0).all(axis=0)]
+    likeness = max(likeness, correlation(*objects) if objects.size else -1.0)
     if likeness < INVERTED:  # before the unit: disparity may look like another one
         raise InputError(f"depth is inverted: its correlation with the truth is {likeness:.2f}")
     if units_per_m is None:
