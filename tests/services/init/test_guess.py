@@ -121,6 +121,22 @@ def test_the_unit_is_what_a_file_says_or_what_things_on_a_table_have_by_folder()
     assert {group.paths: group.factor for group in groups} == {("0.glb",): 1.0, ("0.obj", "0.stl"): 0.001}
 
 
+def test_a_format_without_units_has_those_and_the_axis_of_the_same_things_in_one_that_says_metres():
+    """As packs of assets have them: a folder for each format, large things, and some that only one of them has."""
+    sizes = {"wall": (4.0, 4.0, 0.5), "fridge": (2.0, 2.5, 1.5), "chair": (0.8, 1.2, 0.7)}
+    metric = [item(f"pack/GLTF format/{name}.gltf", size) for name, size in sizes.items()]
+    for unit, order in ((1.0, (0, 1, 2)), (100.0, (0, 2, 1)), (1000.0, (0, 1, 2))):
+        turned = {name: tuple(unit * size[k] for k in order) for name, size in sizes.items()}
+        same = [item(f"pack/obj/{name}.obj", size) for name, size in turned.items()]
+        alone = item("pack/obj/fridge_door.obj", tuple(unit * extent for extent in (2.0, 1.5, 0.7)))
+        of = {path: group.factor for group in guess_groups([*metric, alone], same) for path in group.paths}
+        assert of == {**{each.path: 1.0 for each in metric}, alone.path: 1.0 / unit}
+        assert guess_ups([*metric, alone], same)[alone.path][0] == ("y" if order == (0, 1, 2) else "z")
+    other = item("others/obj/fridge_door.obj", (2000.0, 1500.0, 700.0))
+    (group,) = (group for group in guess_groups([*metric, other], same) if other.path in group.paths)
+    assert group.factor == 0.001
+
+
 def test_up_follows_the_files_that_are_sure_and_a_specification_unless_most_of_all_files_speak_against_it():
     def ups(*items):
         return {path: axis for path, (axis, _) in guess_ups(items).items()}
@@ -254,6 +270,7 @@ def test_one_object_twice_is_offered_once_and_like_shapes_are_not_one():
         (solid("a/m.glb", faces=12), solid("a/m.obj", faces=12)),
         (solid("a/textured.obj", textures=1, faces=12), solid("a/nontextured.ply", faces=12)),
         (solid("bread.xml"), solid("meshes/bread.obj", 1.25)),  # which the model scales
+        (solid("pack/GLTF format/m.glb", faces=12), solid("pack/obj/m.obj", 100.0, faces=12)),
         (solid("x/a.urdf", faces=12), solid("x/visual/b.obj", faces=12)),
         (solid("a.obj", look=RED, textures=1), solid("b/a.obj", look=RED_TURNED, textures=1)),
         (solid("a.obj", look=RED, textures=1), solid("b/a.obj", look=BLUE)),
@@ -265,6 +282,7 @@ def test_one_object_twice_is_offered_once_and_like_shapes_are_not_one():
     for first, second in (
         (solid("a/m.obj"), solid("a/n.obj", 1.1)),  # of another size
         (solid("a/m.obj"), solid("b/m.stl", 1000.0)),
+        (solid("a/glb/m.glb", faces=12), solid("b/obj/m.obj", faces=12)),
         (solid("a.obj"), solid("b.obj", volume=0.31)),
         (solid("a.obj"), solid("b.obj", faces=201)),
         (solid("a/box.obj", faces=12), solid("b/box.obj", faces=12)),

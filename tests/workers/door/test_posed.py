@@ -189,6 +189,53 @@ def test_an_ogre_script_gives_colour_and_picture_to_meshes_and_to_simple_bodies_
             assert level.sum() >= 8 and (grows[level] > 0.0).all() and np.ptp(u, axis=1).max() <= 1.0
 
 
+def test_the_materials_that_come_with_gazebo_have_their_colours(tmp_path):
+    of_gazebo = SCRIPTED.replace("model://m/materials/scripts", "file://media/materials/scripts/gazebo.material")
+    for name, colour in (("Orange", (255, 130, 12)), ("Wood", (178, 178, 178))):
+        body = of_gazebo.format("<box><size>1 2 3</size></box>", name).replace("M/", "Gazebo/")
+        loaded = load_posed(write(tmp_path / "model.sdf", body), LIMITS, tmp_path)
+        assert {tuple(c) for c in seen(loaded.shape)} == {colour}
+        assert ("Gazebo/Wood is not had" in "; ".join(loaded.notes)) == (name == "Wood"), "its picture is not here"
+
+
+def _strip_materials(tree):
+    del tree["materials"], tree["meshes"][0]["primitives"][0]["material"]
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "dae"])
+def test_a_picture_dresses_a_mesh_that_has_coordinates_and_no_picture_of_its_own(suffix, tmp_path):
+    """As parts of Gazebo's have it: their picture is of a script, and the mesh names one that is not defined."""
+    bands = np.repeat(np.array([[[200, 0, 0], [0, 200, 0]]], np.uint8), 2, axis=0)
+    Image.fromarray(bands.repeat(8, axis=1).repeat(8, axis=0)).save(tmp_path / "bands.png")
+    square = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    left = np.array([[0.1, 0.1], [0.3, 0.1], [0.3, 0.9], [0.1, 0.9]])
+    mesh = trimesh.Trimesh(square, [[0, 1, 2], [0, 2, 3]], process=False, visual=trimesh.visual.TextureVisuals(uv=left))
+    corners = "".join(f"v {x} {y} {z}\n" for x, y, z in square) + "".join(f"vt {u} {v}\n" for u, v in left)
+    heads = "".join(f"property float {name}\n" for name in "xyzst")
+    rows = "".join(f"{x} {y} {z} {u} {v}\n" for (x, y, z), (u, v) in zip(square, left, strict=True))
+    data = {
+        "obj": f"{corners}f 1/1 2/2 3/3\nf 1/1 3/3 4/4\n",
+        "ply": f"ply\nformat ascii 1.0\nelement vertex 4\n{heads}element face 1\nproperty list uchar int vertex_indices\n"
+        f"end_header\n{rows}4 0 1 2 3\n",
+        "glb": mesh.export(file_type="glb", tree_postprocessor=_strip_materials),
+        "dae": dae(image="")["a.dae"].replace(b"<init_from></init_from>", b""),
+    }
+    write(tmp_path / f"m.{suffix}", data[suffix])
+    dressed = visual(
+        f'<mesh filename="m.{suffix}"/>', material='<material name="k"><texture filename="bands.png"/></material>'
+    )
+    loaded = load_posed(write(tmp_path / "a.urdf", urdf(dressed)), LIMITS, tmp_path)
+    if suffix != "dae":  # which has a material of its own, and a URDF leaves that
+        assert {tuple(c) for c in seen(loaded.shape)} == {(200, 0, 0)}, loaded.notes
+    write(tmp_path / "a.material", "material M/Bands\n{ pass { texture_unit { texture bands.png\n } } }")
+    body = SCRIPTED.format(f"<mesh><uri>m.{suffix}</uri></mesh>", "Bands").replace(
+        "model://m/materials/scripts", "a.material"
+    )
+    loaded = load_posed(write(tmp_path / "model.sdf", body), LIMITS, tmp_path)
+    colours = {(200, 0, 0), (0, 200, 0)} if suffix == "dae" else {(200, 0, 0)}
+    assert {tuple(c) for c in seen(loaded.shape)} == colours and "plain base" not in "; ".join(loaded.notes)
+
+
 SDF = """<sdf version="1.6"><model name="m"><pose>0 0 1 0 0 0</pose><link name="l"><pose degrees="true">1 0 0 0 0 90</pose>
 <collision name="c"><geometry><mesh><uri>hull.obj</uri></mesh></geometry></collision>
 <visual name="v"><pose>1 0 0 0 0 0</pose><geometry><mesh><uri>model://mug/meshes/cube.obj</uri><scale>0.1 0.2 0.3</scale></mesh>

@@ -56,6 +56,10 @@ _EVALUATION = re.compile(r"(.*/|)models_[a-z]+/(obj_\d+\.ply)")
 """BOP has an object's coarser meshes beside its `models`."""
 _SEEN = re.compile(r"[\s_.-]+(?:vis|visual)$", re.IGNORECASE)
 
+FORMAT_FOLDER = r"(?:obj|stl|ply|glb|gltf|urdf|mjcf|sdf|dae|off|fbx|3d)(?:[\s_.-]*(?:format|files?|models?))?"
+"""The name of a folder that says in what format its files are."""
+_FORMAT = re.compile(FORMAT_FOLDER, re.IGNORECASE)
+
 
 def find_copies(paths: Iterable[str], everything: Sequence[str]) -> dict[str, str]:
     """Of the paths, by their names: collision shapes and coarser levels of detail, with the file that each belongs to.
@@ -180,7 +184,7 @@ def _is_double(item: Item, other: Item, size_m: Callable[[Item], float]) -> bool
         return True
     mine, theirs = item.measured, other.measured
     posed = (item.suffix in POSED) != (other.suffix in POSED)
-    near = item.suffix != other.suffix and _nested(_parent(item.path), _parent(other.path), posed)
+    near = item.suffix != other.suffix and _nested(home(item.path)[0], home(other.path)[0], posed)
     if mine.faces < FEW and not (near and (_name(item) == _name(other) or posed)):
         return False
     ours, others = _shape(item), _shape(other)
@@ -197,6 +201,12 @@ def _differ(look: Sequence[float], other: Sequence[float]) -> float:
     one, two = (np.reshape(colours, (LOOK_SIDE, LOOK_SIDE, LOOK_SIDE, 3)) for colours in (look, other))
     turned = (two.transpose(*axes, 3)[tuple(slice(None, None, flip) for flip in flips)] for axes, flips in _TURNS)
     return min(float(np.abs(one - each).max(axis=-1).sum()) for each in turned)
+
+
+def home(path: str) -> tuple[str, str]:
+    """(the folder of a file, its name): the same of one thing in several formats, also where each has a folder of its own."""
+    folders = (name for name in PurePosixPath(path).parts[:-1] if not _FORMAT.fullmatch(name))
+    return "/".join(folders), _stem(path)
 
 
 def _name(item: Item) -> str:

@@ -4,14 +4,14 @@ import math
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import PurePosixPath
 from statistics import median
 
 from schemas.job.assets import LONGEST, LONGEST_BYTES, TABLE, UpAxis, is_letter, is_usable
-from workers.assets.library.copies import Item
+from workers.assets.library.copies import ALIKE, FORMAT_FOLDER, Item, home
 from workers.door.meshes.urdf import POSED
 
 METRIC = frozenset({".glb", ".gltf", ".dae", *POSED})
@@ -65,12 +65,13 @@ AGREE = 2 / 3
 """Share of the files that tell which axis is up that must agree."""
 
 
-def guess_groups(items: Sequence[Item]) -> list[Group]:
-    """The files by their scale, with the reasons of each format."""
+def guess_groups(items: Sequence[Item], doubles: Sequence[Item] = ()) -> list[Group]:
+    """The files by their scale, with the reasons of each format. doubles: what is one of them again, and tells of units too."""
     scales: dict[tuple[float, float | None], list[tuple[list[Item], str]]] = {}
+    told = {item.path: number for item, _, number in _elsewhere([*items, *doubles])}
     for suffix in sorted({item.suffix for item in items}):
-        mine = [item for item in items if item.suffix == suffix]
-        for factor, diagonal_m, some, why in _guess_scales(suffix, mine):
+        mine, more = ([item for item in some if item.suffix == suffix] for some in (items, doubles))
+        for factor, diagonal_m, some, why in _guess_scales(suffix, mine, more, told):
             scales.setdefault((factor, diagonal_m), []).append((some, why))
     return [
         Group(
@@ -83,7 +84,24 @@ def guess_groups(items: Sequence[Item]) -> list[Group]:
     ]
 
 
-def _guess_scales(suffix: str, items: Sequence[Item]) -> list[tuple[float, float | None, list[Item], str]]:
+def _elsewhere(items: Sequence[Item]) -> Iterator[tuple[Item, Item, int]]:
+    """(item of a format without units, the same thing in one that says metres, number of the unit in which both are as large)."""
+    metric = {home(item.path): item for item in items if item.suffix in METRIC.difference(POSED)}
+    for item in items:
+        if item.suffix not in METRIC and item.measured.unit_m is None and (same := metric.get(home(item.path))):
+            theirs = [(same.measured.unit_m or 1.0) * extent for extent in sorted(same.measured.extents)]
+            for number, (unit, _) in enumerate(UNITS):
+                if _alike([unit * extent for extent in sorted(item.measured.extents)], theirs):
+                    yield item, same, number
+
+
+def _alike(extents: Sequence[float], others: Sequence[float]) -> bool:
+    return all(abs(a - b) <= ALIKE * max(others) for a, b in zip(extents, others, strict=True))
+
+
+def _guess_scales(
+    suffix: str, items: Sequence[Item], doubles: Sequence[Item], told: Mapping[str, int]
+) -> list[tuple[float, float | None, list[Item], str]]:
     """Of the files of one format: scale, diagonal where sizes are normalised, the files that it holds for, and why."""
     scales = list[tuple[float, float | None, list[Item], str]]()
     for unit in sorted({item.measured.unit_m for item in items if item.measured.unit_m is not None}):
@@ -97,7 +115,8 @@ def _guess_scales(suffix: str, items: Sequence[Item]) -> list[tuple[float, float
     if alike and suffix not in METRIC:
         why = f"{_told(suffix, rest, items)}, all alike, as shapes without a unit have it: resized to 0.25 m"
         return [*scales, (1.0, 0.25, rest, why)]
-    units = _guess_units({item.path: item.diagonal for item in rest}, suffix in METRIC)
+    known = [*rest, *(item for item in doubles if item.measured.unit_m is None)]
+    units = _guess_units({item.path: item.diagonal for item in known}, suffix in METRIC, told)
     for number, (factor, name) in enumerate(UNITS):
         if some := [item for item in rest if units[item.path] == number]:
             scales.append((factor, None, some, f"{_told(suffix, some, items)}: {_reading(suffix, some, factor, name)}"))
@@ -173,8 +192,8 @@ class _Folder:
         return self.costs[unit] > min(self.costs) + SPLIT
 
 
-def _guess_units(sizes: Mapping[str, float], specified: bool) -> dict[str, int]:
-    """For each file the number of its unit in `UNITS`: the cheapest that is the same for neighbours.
+def _guess_units(sizes: Mapping[str, float], specified: bool, told: Mapping[str, int]) -> dict[str, int]:
+    """For each file the number of its unit in `UNITS`: that which is told, or the cheapest that is the same for neighbours.
 
     A folder has one unit, unless what lies in it says another by more than `SPLIT`; so do its own folders.
     """
@@ -185,6 +204,8 @@ def _guess_units(sizes: Mapping[str, float], specified: bool) -> dict[str, int]:
             at = at.below.setdefault(name, _Folder({}, [0.0] * len(UNITS)))
         at.size = size
         at.costs = [_cost(size, unit, specified) for unit in range(len(UNITS))]
+        if path in told:
+            at.costs = [IMPOSSIBLE * (unit != told[path]) for unit in range(len(UNITS))]
     costs = root.finish()
     return root.units(costs.index(min(costs))) if sizes else {}
 
@@ -195,11 +216,15 @@ def length(metres: float) -> str:
     return f"{metres / unit:.3g} {name}"
 
 
-def guess_ups(items: Sequence[Item]) -> dict[str, tuple[UpAxis, str]]:
-    """For each file the axis that is up, and why: what it says itself, what its first folder shows, or its whole format."""
-    ups = dict[str, tuple[UpAxis, str]]()
-    for suffix in sorted({item.suffix for item in items}):
-        group = [item for item in items if item.suffix == suffix]
+def guess_ups(items: Sequence[Item], doubles: Sequence[Item] = ()) -> dict[str, tuple[UpAxis, str]]:
+    """For each file the axis that is up, and why: what it says itself, what its first folder shows, or its whole format.
+
+    doubles: what is one of them again. Where the same things are there in a format whose axis is known, their extents tell it.
+    """
+    ups = _ups_elsewhere(items, [*items, *doubles])
+    rest = [item for item in items if item.path not in ups]
+    for suffix in sorted({item.suffix for item in rest}):
+        group = [item for item in rest if item.suffix == suffix]
         stated = Counter(item.measured.stated_up for item in group).most_common(1)[0][0]
         specified = stated or SPECIFIED_UP.get(suffix)
         odd = [item for item in group if item.measured.stated_up != stated]
@@ -216,6 +241,24 @@ def guess_ups(items: Sequence[Item]) -> dict[str, tuple[UpAxis, str]]:
             if item.measured.confidence == "sure" and item.measured.up not in (None, ups[item.path][0]):
                 assert item.measured.up is not None
                 ups[item.path] = item.measured.up, "stands on this axis alone, unlike its neighbours"
+    return ups
+
+
+def _ups_elsewhere(items: Sequence[Item], every: Sequence[Item]) -> dict[str, tuple[UpAxis, str]]:
+    """As `guess_ups`, of items that lie where most of the same things in another format show one axis; every: with doubles."""
+    votes = dict[tuple[str, str], Counter[UpAxis]]()
+    for item, same, _ in _elsewhere(every):
+        (x, y, z), factor = same.measured.extents, same.diagonal / item.diagonal
+        ours = [factor * extent for extent in item.measured.extents]
+        known: tuple[tuple[UpAxis, Sequence[float]], ...] = ("y", (x, y, z)), ("z", (x, z, y))
+        shown = [up for up, theirs in known if _alike(ours, theirs)]
+        if SPECIFIED_UP.get(same.suffix) == "y" and same.measured.stated_up is None and len(shown) == 1:
+            votes.setdefault((item.suffix, home(item.path)[0]), Counter())[shown[0]] += 1
+    ups = dict[str, tuple[UpAxis, str]]()
+    for item in items:
+        for axis, count in votes.get((item.suffix, home(item.path)[0]), Counter[UpAxis]()).most_common(1):
+            if count >= AGREE * votes[item.suffix, home(item.path)[0]].total():
+                ups[item.path] = axis, f"as {count} of the same things in another format"
     return ups
 
 
@@ -263,8 +306,7 @@ BY_FOLDER, BY_FILE, BY_PARENT = "folder", "file", "parent"
 """The ways to name a category; any other word names them all."""
 
 _GENERIC = re.compile(
-    "mesh(es)?|models?|files?|objects?|assets?|data|visuals?|textured|collada|train|test|val|"
-    r"(obj|stl|ply|glb|gltf|urdf|mjcf|sdf|dae|off|fbx|3d)( format| files)?",
+    f"mesh(es)?|models?|files?|objects?|assets?|data|visuals?|textured|collada|train|test|val|{FORMAT_FOLDER}",
     re.IGNORECASE,
 )
 """Names of folders that say what files are, and not what things are."""

@@ -267,8 +267,9 @@ def _decide(surveys: Sequence[Survey], left_out: Mapping[str, LeftOut], making: 
     fit = [item for item in items if SMALLEST_M <= size_m(item) <= LARGEST_M]
     doubles = {double.path: double for double in find_doubles(fit, size_m, SUFFIXES)}
     different = [item for item in items if item.path not in doubles]
-    of = {path: group for group in guess_groups(different) for path in group.paths}
-    ups = guess_ups(different)
+    same = [item for item in items if item.path in doubles]
+    of = {path: group for group in guess_groups(different, same) for path in group.paths}
+    ups = guess_ups(different, same)
     objects = [survey.path for survey in known if survey.path not in doubles]
     categories, joined = name_categories(objects, making.category_from), find_joined(objects, making.category_from)
     by_path, rows = {item.path: item for item in items}, []

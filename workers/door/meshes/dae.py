@@ -167,11 +167,12 @@ class _File:
         vertices, faces = index_corners(columns, [len(given[kind][1]) for kind in kinds])
         rows = {kind: given[kind][1][vertices[:, k]] for k, kind in enumerate(kinds)}
         flat = rows["TEXCOORD"][:, :2] if "TEXCOORD" in rows else None
-        if material.texture is not None and (flat is None or not np.isfinite(flat).all()):
+        flat = flat if flat is not None and np.isfinite(flat).all() else None
+        if flat is None:
             material = replace(material, texture=None)
-        visual = MeshVisual(material, flat if material.texture is not None else None)
+        visual = MeshVisual(material, flat)
         if "COLOR" in rows and material.texture is None:
-            visual = MeshVisual(replace(WHITE, roughness=material.roughness), None, _bytes(rows["COLOR"]))
+            visual = MeshVisual(replace(WHITE, roughness=material.roughness), flat, _bytes(rows["COLOR"]))
         shaded = rows["NORMAL"][:, :3] if "NORMAL" in rows else None
         yield RawMesh(rows["POSITION"], faces, shaded, visual, matrix)
 

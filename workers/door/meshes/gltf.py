@@ -215,11 +215,13 @@ class _File:
             colors = _colors(self._accessor(attributes["COLOR_0"], None), count)
         if colors is not None and (look is None or look.opaque):
             colors[:, 3] = 255
+        coordinates = "TEXCOORD_0" if look is None else look.coordinates
+        uv = self._accessor(attributes[coordinates], 2) if coordinates in attributes else None
+        uv = None if uv is None or uv.shape != (count, 2) or not np.isfinite(uv).all() else uv
         if look is None:  # the default material of the format is white; of a file without any it is told by nothing
             plain = WHITE if colors is not None or self.tree.get("materials") else DEFAULT
-            return MeshVisual(plain, None, colors)
-        uv = self._accessor(attributes[look.coordinates], 2) if look.coordinates in attributes else None
-        if uv is None or uv.shape != (count, 2) or not np.isfinite(uv).all():
+            return MeshVisual(plain, None if uv is None else np.column_stack([uv[:, 0], 1.0 - uv[:, 1]]), colors)
+        if uv is None:
             return MeshVisual(replace(look.material, texture=None), None, colors)
         return self.materials.visual(look, uv, colors)
 

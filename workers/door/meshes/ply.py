@@ -271,15 +271,16 @@ def _meshes(
         points, index = points[index.ravel()], np.arange(index.size).reshape(-1, 3)
         flat = corners[..., 0].ravel()
         normals, colors = (None if array is None else array[flat] for array in (normals, colors))
-    if uv is None or not pictures or not np.isfinite(uv).all():
-        visual = MeshVisual(WHITE if colors is not None or by_face is not None else DEFAULT, colors=colors)
+    uv = None if uv is None or not np.isfinite(uv).all() else np.asarray(uv, np.float64)
+    if uv is None or not pictures:
+        material = WHITE if colors is not None or by_face is not None else DEFAULT
         shown = None if by_face is None or face is None else by_face[face]
-        return [RawMesh(points, index, normals, MeshVisual(visual.material, None, colors, shown), np.eye(4))]
+        return [RawMesh(points, index, normals, MeshVisual(material, uv, colors, shown), np.eye(4))]
     which = np.zeros(len(index), np.int64)
     if faces is not None and face is not None and "texnumber" in faces:
         which = np.clip(np.asarray(faces["texnumber"], np.int64)[face], 0, len(pictures) - 1)
     return [
-        RawMesh(points, index[which == k], normals, MeshVisual(pictures[k], np.asarray(uv, np.float64)), np.eye(4))
+        RawMesh(points, index[which == k], normals, MeshVisual(pictures[k], uv), np.eye(4))
         for k in np.unique(which).tolist()
     ]
 

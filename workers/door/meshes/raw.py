@@ -31,6 +31,9 @@ _UNDECODABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning
 """What reading a stranger's picture may raise."""
 LONGEST_NAME = 1024
 """Letters of a file name that are looked at."""
+UNPAINTED = "plain base colour used"
+"""The end of notes on pictures and materials that are left out."""
+
 MOST_NOTES = 20
 """Notes that are kept of an asset: they are stored in the dataset."""
 LONGEST_NOTE = 1000
@@ -338,7 +341,7 @@ class FolderResolver:
     def note(self, name: str, why: str) -> None:
         """Notes that a picture or material is left out."""
         if len(self.notes) < MOST_NOTES:
-            self.notes.append(plain_line(f"{name:.{LONGEST_NAME}} {why}: plain base colour used", LONGEST_NOTE))
+            self.notes.append(plain_line(f"{name:.{LONGEST_NAME}} {why}: {UNPAINTED}", LONGEST_NOTE))
 
 
 def open_image(data: bytes, limits: MeshLimits) -> tuple[tuple[int, int], str | None]:
@@ -376,7 +379,7 @@ def decode_picture(source: bytes | Image.Image, notes: list[str]) -> NDArray[np.
                 alpha = "A" in image.getbands() or "transparency" in image.info
                 pixels = np.array(image.convert("RGBA" if alpha else "RGB"), dtype=np.uint8)
     except _UNDECODABLE as error:
-        notes.append(f"a texture cannot be decoded ({describe_error(error)}): plain base colour used")
+        notes.append(f"a texture cannot be decoded ({describe_error(error)}): {UNPAINTED}")
         return None
     pixels.setflags(write=False)
     return pixels

@@ -28,7 +28,7 @@ from workers.door.meshes.posed import (
     turned,
     wrap_body,
 )
-from workers.door.meshes.raw import DEFAULT, check_counts, check_nodes, find_inside
+from workers.door.meshes.raw import DEFAULT, UNPAINTED, check_counts, check_nodes, find_inside
 from workers.door.opening import as_utf8, read_bytes
 
 
@@ -71,7 +71,7 @@ def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
     for visual in model.visuals:
         body = wrap_body(visual.body) if visual.body is not None and visual.texture is not None else visual.body
         loaded = load(visual.mesh or "") if body is None else LoadedMesh(Shape((body,)), ())
-        source.notes += loaded.notes
+        source.notes += [note for note in loaded.notes if not (visual.dresses and note.endswith(UNPAINTED))]
         for part in transform_shape(loaded.shape, visual.T).parts:
             check_coordinates(path, part.vertices)
             dressed = with_jpeg(_dressed(part, visual, source), source)
@@ -89,9 +89,7 @@ def _dressed(part: Part, visual: Visual, source: Source) -> Part:
         return part
     texture = None if visual.texture is None else source.picture(visual.texture)
     if texture is not None and part.uv is None:
-        source.notes.append(
-            f"{visual.texture:.200} needs texture coordinates, which the mesh has not: plain base colour used"
-        )
+        source.notes.append(f"{visual.texture:.200} needs texture coordinates, which the mesh has not: {UNPAINTED}")
         texture = None
     if visual.colour is None and texture is None:
         return part
@@ -192,8 +190,29 @@ def _colour(path: Path, text: str | None) -> Array | None:
 
 
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.DOTALL)
-_DIFFUSE = re.compile(r"^\s*diffuse((?:\s+(?:\d+\.?\d*|\.\d+)){3,4})\s*$", re.MULTILINE)
-_TEXTURE = re.compile(r"^\s*texture\s+(\S+)", re.MULTILINE)
+_DIFFUSE = re.compile(r"(?:^|{)\s*diffuse((?:\s+(?:\d+\.?\d*|\.\d+)){3,4})\s*(?:}|$)", re.MULTILINE)
+_TEXTURE = re.compile(r"(?:^|{)\s*texture\s+(\S+)", re.MULTILINE)
+
+
+_GAZEBO: Mapping[str, tuple[float, float, float]] = {
+    "Grey": (0.7, 0.7, 0.7),
+    "DarkGrey": (0.175, 0.175, 0.175),
+    "White": (1.0, 1.0, 1.0),
+    "FlatBlack": (0.1, 0.1, 0.1),
+    "Black": (0.0, 0.0, 0.0),
+    "Red": (1.0, 0.0, 0.0),
+    "RedBright": (0.87, 0.26, 0.07),
+    "Green": (0.0, 1.0, 0.0),
+    "Blue": (0.0, 0.0, 1.0),
+    "SkyBlue": (0.13, 0.44, 0.7),
+    "Yellow": (1.0, 1.0, 0.0),
+    "ZincYellow": (0.9725, 0.9529, 0.2078),
+    "Purple": (1.0, 0.0, 1.0),
+    "Turquoise": (0.0, 1.0, 1.0),
+    "Orange": (1.0, 0.5088, 0.0468),
+    "Gold": (0.8, 0.64869, 0.120759),
+}
+"""Colours of the materials that come with Gazebo, which models name and do not bring along: diffuse, and of SkyBlue ambient."""
 
 
 def _read_script(source: Source, script: ElementTree.Element) -> tuple[Array | None, str | None] | None:
@@ -221,7 +240,9 @@ def _read_script(source: Source, script: ElementTree.Element) -> tuple[Array | N
             near = [folder / picture[1] for folder in (*places, file.parent, file.parent.with_name("textures"))]
             there = find_inside(source.root, *near)
             return colour, picture[1] if there is None else relpath(there, source.path.parent)
-    source.notes.append(f"the material script {name:.80} is not had, or has no colour: plain base colour used")
+    if name.startswith("Gazebo/") and (known := _GAZEBO.get(name.removeprefix("Gazebo/"))):
+        return np.array([*known, 1.0]), None
+    source.notes.append(f"the material script {name:.80} is not had, or has no colour: {UNPAINTED}")
     return None
 
 
