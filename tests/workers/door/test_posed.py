@@ -251,6 +251,8 @@ def test_an_sdf_is_read_as_its_poses_say_and_what_it_does_not_hold_is_named(tmp_
         write(tmp_path / name, CUBE)
     path = write(tmp_path / "model.sdf", SDF)
     mesh, cylinder, box = boxes(load_posed(path, LIMITS, tmp_path).shape)
+    remarked = write(tmp_path / "remarked.sdf", f"<!-- of <?xml?> -->\n<!-- ours -->\n<?xml version='1.0'?>\n{SDF}")
+    assert np.array_equal(boxes(load_posed(remarked, LIMITS, tmp_path).shape), [mesh, cylinder, box])
     # A quarter turn about z takes the mesh's x in [0, 0.1] and y in [0, 0.2] to y and -x, from the link's place at (1, 1, 1).
     assert mesh == pytest.approx(np.array([[0.8, 1.0, 1.0], [1.0, 1.1, 1.3]]))
     assert cylinder == pytest.approx(np.array([[0.9, -0.1, 0.8], [1.1, 0.1, 1.2]]), abs=1e-3)

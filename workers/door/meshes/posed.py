@@ -19,7 +19,7 @@ from workers.door.meshes.raw import DEFAULT, LONGEST_NAME, FolderResolver, check
 from workers.door.opening import as_utf8, read_bytes
 from workers.geometry.frames import pose, rotation_about
 
-_DECLARATION = re.compile(rb"^\s*<\?xml[^>]*\?>")
+_DECLARATION, _REMARK = re.compile(rb"<\?xml\s[^>]*\?>"), re.compile(rb"<!--.*?-->", re.DOTALL)
 _NAMESPACE = re.compile(rb"\sxmlns=([\"'])[^\"']*\1")
 _PREFIX = re.compile(rb"(</?|\s)([A-Za-z_][\w.-]*):(?=[A-Za-z_])")
 MAX_XML_BYTES = 10_000_000
@@ -112,8 +112,11 @@ def parse_tree(path: Path, data: bytes, tags: Sequence[str], kind: str) -> Eleme
     """
     if b"<!" in data.replace(b"<!--", b"").replace(b"<![CDATA[", b"") or b"\0" in data:
         raise MeshError("unreadable", f"{path} has a document type or entities, which are refused, or is no text")
-    # pybullet's own files declare XML version 0.0, which no parser accepts.
-    data = _NAMESPACE.sub(b"", _DECLARATION.sub(b"", data, count=1), count=1)
+    # pybullet's own files declare XML version 0.0, which no parser accepts, and Gazebo's after a remark.
+    declared = _DECLARATION.search(data)
+    if declared is not None and not _REMARK.sub(b"", data[: declared.start()]).strip():
+        data = data[declared.end() :]
+    data = _NAMESPACE.sub(b"", data, count=1)
     if b"xmlns:" not in data:
         data = _PREFIX.sub(rb"\1\2_", data)  # robots' own parsers know no namespaces, and let such pass undeclared
     try:

@@ -152,13 +152,22 @@ def _origin(path: Path, element: ElementTree.Element) -> Pose:
     return np.eye(4) if origin is None else turned(path, origin.get("xyz", "0 0 0"), origin.get("rpy", "0 0 0"))
 
 
+_NOT_READ = ("submesh", "heightmap", "polyline")
+"""Shapes that an SDF may have."""
+
+
 def read_sdf(source: Source) -> Model:
     """The visuals of all links of an SDF's model, joints at zero."""
     path, root = source.path, source.parse(source.path, ["sdf"], "an SDF")
-    for tag in ("world", "include", "submesh", "heightmap", "polyline"):
+    others = "init its models' own files"
+    for tag, remedy in {
+        "world": others,
+        "include": others,
+        **dict.fromkeys(_NOT_READ, "export it as one mesh"),
+    }.items():
         if root.find(f".//{tag}") is not None:
             what = "is a world, and no object" if tag == "world" else f"has <{tag}>, which is not read"
-            raise MeshError("format", f"{path} {what}: init its models' own files")
+            raise MeshError("format", f"{path} {what}: {remedy}")
     visuals = [visual for model in root.iterfind("model") for visual in _of_model(source, model, np.eye(4), 0)]
     names = dict.fromkeys((mesh.findtext("uri") or "").strip() for mesh in root.iterfind(".//geometry/mesh"))
     return Model(tuple(visuals), tuple(names))
