@@ -189,6 +189,8 @@ COPIES = {
     "car_LOD0.glb": ("car_LOD1.glb", "car_LOD2.glb"),
     "jar.obj": ("jar_lod1.obj", "UCX_jar_01.obj"),
     "lamp_lod2.obj": ("lamp_lod3.obj",),
+    "bun_zipper.ply": ("bun_zipper_res2.ply",),
+    "bun_zipper_res2.ply": ("bun_zipper_res4.ply",),
 }
 ORIGINALS = (
     "duck_vhacd.urdf",
@@ -271,6 +273,8 @@ def test_one_object_twice_is_offered_once_and_like_shapes_are_not_one():
         (solid("a/textured.obj", textures=1, faces=12), solid("a/nontextured.ply", faces=12)),
         (solid("bread.xml"), solid("meshes/bread.obj", 1.25)),  # which the model scales
         (solid("pack/GLTF format/m.glb", faces=12), solid("pack/obj/m.obj", 100.0, faces=12)),
+        (solid("pack/GLTF format/m.glb", look=RED), solid("pack/DAE format/m.dae", look=BLUE)),
+        (solid("pack/GLTF format/m.glb", faces=116), solid("pack/DAE format/m.dae", faces=115)),  # without an empty one
         (solid("x/a.urdf", faces=12), solid("x/visual/b.obj", faces=12)),
         (solid("a.obj", look=RED, textures=1), solid("b/a.obj", look=RED_TURNED, textures=1)),
         (solid("a.obj", look=RED, textures=1), solid("b/a.obj", look=BLUE)),
@@ -283,6 +287,7 @@ def test_one_object_twice_is_offered_once_and_like_shapes_are_not_one():
         (solid("a/m.obj"), solid("a/n.obj", 1.1)),  # of another size
         (solid("a/m.obj"), solid("b/m.stl", 1000.0)),
         (solid("a/glb/m.glb", faces=12), solid("b/obj/m.obj", faces=12)),
+        (solid("a/glb/m.glb", look=RED), solid("a/obj/n.obj", look=BLUE)),
         (solid("a.obj"), solid("b.obj", volume=0.31)),
         (solid("a.obj"), solid("b.obj", faces=201)),
         (solid("a/box.obj", faces=12), solid("b/box.obj", faces=12)),

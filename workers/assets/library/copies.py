@@ -51,7 +51,8 @@ _NAMED = re.compile(rf"(.+?)(?:[\s_.-]+(?:{_COLLIDES})(?:[\s_.-]*\d+)*)+", re.IG
 _NAMED_BEFORE = re.compile(r"(?:UCX|UBX|USP|UCP)_(.+?)(?:_\d+)?")
 """As Unreal has it."""
 _FOLDER = re.compile(rf"(?:{_COLLIDES})(?:[\s_.-]*mesh(?:es)?)?", re.IGNORECASE)
-_LEVEL = re.compile(r"(.+?)[\s_.-]*lod[\s_.-]*(\d+)", re.IGNORECASE)
+_LEVEL = re.compile(r"(.+?)(?:[\s_.-]*lod|[\s_.-]+res)[\s_.-]*(\d+)", re.IGNORECASE)
+"""Also as Stanford's scans have it: bun_zipper_res2."""
 _EVALUATION = re.compile(r"(.*/|)models_[a-z]+/(obj_\d+\.ply)")
 """BOP has an object's coarser meshes beside its `models`."""
 _SEEN = re.compile(r"[\s_.-]+(?:vis|visual)$", re.IGNORECASE)
@@ -162,18 +163,20 @@ def find_doubles(items: Sequence[Item], size_m: Callable[[Item], float], formats
     """The items that are another one again: the same shape and size in metres, or in one folder the same shape.
 
     Two shapes are the same that have as many faces, and extents, area and volume alike in whatever order of axes; unless
-    both have pictures, or neither has, and their colours differ where faces lie. That stays which has pictures, then colours,
-    then the format that comes first in `formats`.
+    both have pictures, or neither has, and their colours differ where faces lie. One name in two formats needs no more than
+    extents and area alike: readers drop faces, and some programs write other colours as linear light. That stays which has
+    pictures, then colours, then the format that comes first in `formats`.
     """
     order = sorted(
         items,
         key=lambda one: (not one.measured.textures, one.measured.look is None, formats.index(one.suffix), one.path),
     )
-    seen, left_out = dict[int, list[tuple[Item, str]]](), list[LeftOut]()
+    seen, left_out = dict[int | tuple[str, str], list[tuple[Item, str]]](), list[LeftOut]()
     for item in order:
-        same = seen.setdefault(item.measured.faces, [])
-        original = next((of for one, of in same if _is_double(item, one, size_m)), None)
-        same.append((item, original or item.path))
+        like = [seen.setdefault(key, []) for key in (item.measured.faces, home(item.path))]
+        original = next((of for some in like for one, of in some if _is_double(item, one, size_m)), None)
+        for some in like:
+            some.append((item, original or item.path))
         if original is not None:
             left_out.append(LeftOut(item.path, COPY, f"double of {original}"))
     return left_out
@@ -185,13 +188,18 @@ def _is_double(item: Item, other: Item, size_m: Callable[[Item], float]) -> bool
     mine, theirs = item.measured, other.measured
     posed = (item.suffix in POSED) != (other.suffix in POSED)
     near = item.suffix != other.suffix and _nested(home(item.path)[0], home(other.path)[0], posed)
-    if mine.faces < FEW and not (near and (_name(item) == _name(other) or posed)):
+    same = near and _name(item) == _name(other)
+    if mine.faces < FEW and not (same or (near and posed)):
+        return False
+    if mine.faces != theirs.faces and not same:
         return False
     ours, others = _shape(item), _shape(other)
+    if same:  # empty faces are dropped, and the volume of an open shape is not of the shape alone
+        ours, others = ours[:-1], others[:-1]
     pairs = zip(ours if near else (*ours, size_m(item)), others if near else (*others, size_m(other)), strict=True)
     if not all(abs(a - b) <= ALIKE * max(abs(a), abs(b), SMALL) for a, b in pairs):
         return False
-    if mine.look is None or theirs.look is None or bool(mine.textures) != bool(theirs.textures):
+    if same or mine.look is None or theirs.look is None or bool(mine.textures) != bool(theirs.textures):
         return True
     return _differ(mine.look, theirs.look) <= ALIKE_COLOUR
 
