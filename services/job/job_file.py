@@ -290,17 +290,37 @@ NEEDS: dict[str, tuple[tuple[str, Acts], ...]] = {
 """Keys of scenes by what must hold for them to act: a phrase for where it does not, and whether it does."""
 
 
+OF_SCENES = {
+    "cameras.orbit": "a virtual capture has captures.simulate.distance_m and inclination_rad",
+    "cameras.sensor": "a virtual capture has captures.simulate.image_scale",
+    "start": "the object of a capture stands on its board",
+    "physics": "nothing falls in a capture",
+}
+"""Branches of keys that a capture has not, and why."""
+
+
 def describe_idle(job: Job) -> list[str]:
     """A line for each key that has another value than its default and cannot act."""
     if job.captures is not None:
-        return []
-    lines = []
-    for key, needs in NEEDS.items():
-        branch, _, name = key.rpartition(".")
-        model = reduce(getattr, branch.split("."), job)
-        value, usual = getattr(model, name), type(model).model_fields[name].default
-        usual = STUDIO.get(key, usual) if job.scene == "studio" else usual
-        why = next((phrase for phrase, acts in needs if not acts(job)), None)
-        if value != usual and why is not None:
-            lines.append(f"{key} is {'given' if isinstance(value, BaseModel) else value} and has no effect: {why}")
-    return lines
+        keys = [f"{branch}.{name}" for branch in OF_SCENES for name in type(_branch(job, branch)).model_fields]
+        lines = [_idle(job, key, OF_SCENES[key.rpartition(".")[0]]) for key in keys]
+        lines.append(_idle(job, "render.tier", "a virtual capture has captures.simulate.tier"))
+    else:
+        unmet = {key: next((phrase for phrase, acts in needs if not acts(job)), None) for key, needs in NEEDS.items()}
+        lines = [_idle(job, key, why) for key, why in unmet.items() if why is not None]
+    return [line for line in lines if line]
+
+
+def _branch(job: Job, branch: str) -> BaseModel:
+    model: BaseModel = reduce(getattr, branch.split("."), job)
+    return model
+
+
+def _idle(job: Job, key: str, why: str) -> str:
+    """The line on a key that cannot act; empty where it has its default."""
+    branch, _, name = key.rpartition(".")
+    model = _branch(job, branch)
+    value, usual = getattr(model, name), type(model).model_fields[name].get_default(call_default_factory=True)
+    usual = STUDIO.get(key, usual) if job.scene == "studio" else usual
+    given = "given" if isinstance(value, BaseModel) else value
+    return "" if value == usual else f"{key} is {given} and has no effect: {why}"

@@ -170,7 +170,9 @@ def open_dictionary(board: Board, folder: Path | None = None) -> "cv2.aruco.Dict
     count, needed = len(dictionary.bytesList), int(board_geometry(board).ids[-1]) + 1
     if count < needed:
         raise CaptureError(
-            "dictionary", f"the dictionary {board.dictionary} has {count} markers, and the board needs {needed}"
+            "dictionary",
+            f"the dictionary {board.dictionary} has {count} markers, and the board needs {needed}: take a larger one, such as "
+            "DICT_4X4_100 or DICT_4X4_1000, or fewer columns and rows",
         )
     return dictionary
 

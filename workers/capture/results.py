@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from schemas.capture import CaptureListing, Reconstruction
 from schemas.errors import AssetSourceError, CaptureError, InputError, command_line
+from schemas.job.captures import Captures
 from schemas.job.job import Job
 from schemas.job.look import OFF, RECOLOUR_VERSION
 from workers.assets.catalogue import Catalogue, Watch, ignore, open_catalogue
@@ -165,6 +166,23 @@ def _list_inputs(path: Path) -> list[Path]:
     return sorted([*(file for file in top if file.name in inputs), *truth])
 
 
+SMALL = 0.1
+"""Size of the pictures in which a lens is looked at: whether it folds over depends on angles alone."""
+
+
+def _check_virtual(captures: Captures) -> None:
+    """Raises AssetSourceError where no virtual capture can be made: of this board, or with this lens."""
+    from workers.capture.board import open_dictionary  # of virtual captures alone
+    from workers.capture.simulate.studio import make_rig, pinhole_lookup
+
+    try:
+        open_dictionary(captures.printed_board)
+        if captures.simulate.distortion is not None:
+            pinhole_lookup(captures.simulate.distortion, make_rig(min(SMALL, captures.simulate.image_scale)).color)
+    except CaptureError as error:
+        raise AssetSourceError(f"captures: {error.detail}") from error
+
+
 def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue:
     """The job's catalogue; its digest covers every file that the job names.
 
@@ -193,7 +211,10 @@ def open_sources(job: Job, job_folder: Path, watch: Watch = ignore) -> Catalogue
         catalogue = replace(
             catalogue, poses=poses, scenes=scenes, pictures=pictures, maps=maps, recolour=look.recolour, digest=digest
         )
-    if job.captures is None or not job.captures.folders:
+    if job.captures is None:
+        return catalogue
+    if not job.captures.folders:
+        _check_virtual(job.captures)
         return catalogue
     listings, folders = [], job.captures.folders
     for number, name in enumerate(folders):

@@ -461,6 +461,28 @@ def test_each_key_that_cannot_act_is_told_with_its_reason():
         assert line.startswith(f"{key} is ") and why in line, (key, line)
 
 
+def test_keys_of_scenes_that_a_capture_has_not_are_told_and_its_lens_and_board_are_tried_before_it_is_made(
+    tmp_path, capsys
+):
+    own = {"captures": {"simulate": {"views": 4}}, "cameras": {"depth": {"enabled": False}}}
+    assert describe_idle(job_of(changes=own)) == []
+    for key, value in (("start.pose", "tumbled"), ("physics.step_hz", 480), ("cameras.orbit.radius_m", "fit")):
+        (line,) = describe_idle(job_of(key, value, own))
+        assert line.startswith(f"{key} is {value} and has no effect: ")
+    job = tmp_path / "job.yaml"
+    for branch, value, why in (
+        ("simulate", {"views": 4, "distortion": {"k1": -0.3}}, "the lens k1=-0.3 .* folds over"),
+        (
+            "board",
+            {"columns": 10, "rows": 7, "marker_m": 0.03, "gap_m": 0.01},
+            "has 50 markers, and the board needs 70",
+        ),
+    ):
+        job.write_text(yaml.safe_dump({"verso": 1, "name": "t", "captures": {branch: value}}))
+        assert main(["run", str(job), "--dry-run", "--out", str(tmp_path / "out")]) == 2
+        assert re.search(why, capsys.readouterr().err)
+
+
 def test_nothing_is_told_of_keys_that_act_or_are_at_their_defaults():
     assert describe_idle(job_of()) == describe_idle(job_of(changes=ON)) == []
     assert describe_idle(job_of("render.samples", 4)) == []
