@@ -1,6 +1,7 @@
 """`verso init`: a library of a folder of meshes, with a page of pictures of what was read and the job that uses it."""
 
 import argparse
+import hashlib
 import io
 import json
 import math
@@ -10,6 +11,7 @@ import shutil
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +24,7 @@ from schemas.errors import (
     MachineError,
     MeshError,
     OutputError,
+    VersoError,
     command_line,
     plain_line,
     plural,
@@ -30,7 +33,7 @@ from schemas.job.assets import TABLE, Assets, LibrarySource, MeshLimits, is_usab
 from schemas.job.physics import Physics
 from services.init.shown import MOST, cells_of, draw_left_out, draw_sheet, draw_table
 from services.job.bounded_yaml import parse_yaml
-from services.job.job_file import MOST_KEYS, validate_job
+from services.job.job_file import MOST_KEYS, load_job, validate_job
 from services.run.parts import Cut, cut_shapes
 from services.run.progress import finish, show_counts
 from workers.assets.catalogue import Watch
@@ -147,9 +150,9 @@ def _init(options: argparse.Namespace, folder: Path, out: Path, making: Making) 
     notes = [*asked, *draw_left_out(left_out, None)]
     sheet = out / SHEET_FILE if _draw(out / SHEET_FILE, title, library, used, notes) else None
     categories = sorted({row.category for row in used} - {TABLE})
-    _write_job(job, options.scene, folder, used)
+    left = _write_job(job, options.scene, folder, used)
     print(f"{out}: {plural(len(used), 'object')} in {plural(len(categories), 'category')}")
-    print("\n".join(f"  {line}" for line in (*describe_decisions(used), *library.plain, *asked)))
+    print("\n".join(f"  {line}" for line in (*describe_decisions(used), *library.plain, *asked, *filter(None, [left]))))
     look = f"  look at {sheet}, and change in {out / TABLE_FILE} what is wrong; then" if sheet else "  then"
     print(look, command_line("run", job, "--scenes", 8))
     tree = {"library": str(out), "job": str(job), "sheet": sheet and str(sheet), "categories": categories}
@@ -209,12 +212,28 @@ def _count_parts(library: Library, rows: Sequence[Row]) -> dict[str, int]:
     return {cut.row.path: count for cut, count, _ in cut_shapes(cuts) if count}
 
 
-def _write_job(job: Path, scene: str, folder: Path, used: Sequence[Row]) -> None:
-    """Writes the job of this kind of scene beside the table, unless there is one, which a person may have changed."""
+OURS = "# `verso init` writes this file anew unless you change it. As written it has the number "
+"""The last line, with a digest of those above."""
+
+
+def _write_job(job: Path, scene: str, folder: Path, used: Sequence[Row]) -> str:
+    """Writes the job of this kind of scene beside the table; one that a person has changed stays.
+
+    Returns what such a job has of categories that the library has not, and the other way round; empty where all is well.
+    """
     counts = Counter(row.category for row in used)
     tables = counts.pop(TABLE, 0)
-    if job.exists() or not counts:
-        return
+    if not counts:
+        return ""
+    there = job.read_text(encoding="utf-8", errors="replace") if job.exists() else ""
+    if there and there != _with_number(there.partition(OURS)[0]):
+        with suppress(VersoError):
+            named = set(load_job(job).categories)
+            new, gone = (", ".join(sorted(some)) for some in (counts.keys() - named, named - counts.keys()))
+            parts = (f"it lacks {new}" if new else "", f"there is no {gone} any more" if gone else "")
+            if both := "; ".join(filter(None, parts)):
+                return f"{job} was changed and is left as it is: {both}: change its categories, or remove it"
+        return ""
     on_table = scene == "tabletop"
     text = (HEAD + (TABLETOP if on_table else STUDIO)).format(
         objects=plural(counts.total(), "object"),
@@ -231,7 +250,12 @@ def _write_job(job: Path, scene: str, folder: Path, used: Sequence[Row]) -> None
         tables=OWN_TABLES if tables else BUILT_IN_TABLES,
     )
     validate_job(parse_yaml(text, MOST_KEYS), "the new job")
-    write_whole(job, text.encode())
+    write_whole(job, _with_number(f"{text}\n").encode())
+    return ""
+
+
+def _with_number(text: str) -> str:
+    return f"{text}{OURS}{hashlib.sha256(text.encode()).hexdigest()[:16]}\n"
 
 
 def _quoted(text: str) -> str:

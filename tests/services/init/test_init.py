@@ -110,6 +110,23 @@ def test_a_mixed_folder_becomes_a_library_and_a_job_that_offers_exactly_what_was
     assert before == {path: path.read_bytes() for path in before}, "once more, the same"
 
 
+def test_the_job_follows_the_library_until_a_person_changes_it(tmp_path, capsys):
+    folder, job = tmp_path / "meshes", tmp_path / "lib/job.yaml"
+    for name, size in (("cup", 0.1), ("box", 0.2)):
+        (folder / name).mkdir(parents=True)
+        trimesh.creation.box((size, 0.1, 0.15)).export(folder / name / "a.obj")
+    assert init(folder, "--out", tmp_path / "lib", capsys=capsys)[0] == 0
+    assert set(load_job(job).categories) == {"cup", "box"}
+    (folder / "box").rename(folder / "crate")
+    assert "was changed" not in "".join(map(str, init(folder, "--out", tmp_path / "lib", capsys=capsys)))
+    assert set(load_job(job).categories) == {"cup", "crate"}, "as it was not changed"
+    job.write_text(mine := job.read_text().replace("seed: 1", "seed: 2"))
+    (folder / "cup").rename(folder / "mug")
+    told = " ".join(map(str, init(folder, "--out", tmp_path / "lib", capsys=capsys)))
+    assert "job.yaml was changed and is left as it is: it lacks mug; there is no cup any more" in told
+    assert job.read_text() == mine
+
+
 WRONG = (
     (("none",), "none: there is no such folder"),
     (("file",), "file is a file"),
