@@ -6,6 +6,7 @@ specifications, written by hand: glTF 2.0 and its extensions, MTL, and what prog
 
 import base64
 import io
+import re
 import struct
 from dataclasses import dataclass, field
 from typing import Any
@@ -356,6 +357,12 @@ def dae(
     return {"a.dae": text.encode(), "t.png": data or SKIN_PNG}
 
 
+def with_commas(files):
+    """The numbers of a COLLADA file as programs write them in a country of commas."""
+    text = files["a.dae"].replace(b'meter="1.0"', b'meter="1,0"')
+    return {**files, "a.dae": re.sub(rb">[^<]*</float_array>", lambda array: array[0].replace(b".", b","), text)}
+
+
 @dataclass(frozen=True)
 class Right:
     """What is right of a row: colours that are seen, in 8 bits of sRGB; None: a hole."""
@@ -470,6 +477,11 @@ ROWS: dict[str, tuple[dict[str, bytes], Right | str]] = {
     "decimal commas": (
         obj(points=[f"v {x:g} {y:g} {z:g}".replace(".", ",") for x, y, z in CORNERS]),
         Right(note="decimal commas"),
+    ),
+    "decimal commas in a dae": (with_commas(dae(asset='<unit meter="1.0"/>')), Right(note="decimal commas")),
+    "coordinates that are not there": (
+        {**(plain := obj("Kd 1 0 0\n")), "a.obj": re.sub(rb"vt .*\n", b"", plain["a.obj"])},
+        Right(((255, 0, 0),)),
     ),
     "faces of mixed forms": (obj("Kd 1 0 0\n", faces=MIXED), Right(((255, 0, 0),))),
     "counted back": (obj("Kd 1 0 0\n", points=APART, faces=BACK), Right(((255, 0, 0),))),

@@ -41,6 +41,8 @@ from workers.door.meshes.raw import (
 )
 from workers.geometry.frames import pose, rotation_about
 
+_COMMA_UNIT, _COMMA = re.compile(rb"<unit[^>]*\smeter\s*=\s*[\"']\d*,\d"), re.compile(rb"(?<=\d),(?=\d)")
+"""Of programs that write numbers as their country does."""
 _UP = re.compile(rb"<up_axis>\s*([XYZ])_UP")
 _AXES: Mapping[bytes, UpAxis] = {b"X": "x", b"Y": "y", b"Z": "z"}
 _READ = ("POSITION", "TEXCOORD", "NORMAL", "COLOR")
@@ -66,6 +68,9 @@ def read_dae(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
     What is missing or not drawn leaves a note. MeshError `format` where something changes the shape and is not read,
     `index_out_of_range`, `too_large` or `unreadable`.
     """
+    if _COMMA_UNIT.search(data):
+        data = _COMMA.sub(b".", data)
+        resolver.notes.append("decimal commas were read as points")
     return list(_File(path, parse_tree(path, data, ["COLLADA"], "a COLLADA file"), resolver).meshes())
 
 

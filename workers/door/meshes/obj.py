@@ -250,7 +250,9 @@ def _mesh(
     """The mesh of triangles [T, 3, 4]: a vertex for each combination of point, coordinate and normal, in the file's order."""
     points, uv, normals = values
     corners = corners[np.argsort(corners[:, 0, 3], kind="stable"), :, :3]
-    textured = bool((corners[..., 1] >= 0).all())
+    textured = (
+        bool((corners[..., 1] >= 0).all()) and len(uv) > 0
+    )  # some programs number coordinates that they do not write
     shaded = bool((corners[..., 2] >= 0).all()) and len(normals) > 0
     for used, kind, listed in ((textured, 1, uv), (shaded, 2, normals)):
         if used and corners[..., kind].max() >= len(listed):
