@@ -291,20 +291,24 @@ NEEDS: dict[str, tuple[tuple[str, Acts], ...]] = {
 
 
 OF_SCENES = {
-    "cameras.orbit": "a virtual capture has captures.simulate.distance_m and inclination_rad",
-    "cameras.sensor": "a virtual capture has captures.simulate.image_scale",
-    "start": "the object of a capture stands on its board",
-    "physics": "nothing falls in a capture",
+    "cameras.orbit": "captures.simulate.distance_m and inclination_rad",
+    "cameras.sensor": "captures.simulate.image_scale",
+    "start": "",
+    "physics": "",
+    "render": "captures.simulate.tier",
 }
-"""Branches of keys that a capture has not, and why."""
+"""Branches of keys that a capture has not, and what a virtual one has in their place."""
 
 
 def describe_idle(job: Job) -> list[str]:
     """A line for each key that has another value than its default and cannot act."""
     if job.captures is not None:
-        keys = [f"{branch}.{name}" for branch in OF_SCENES for name in type(_branch(job, branch)).model_fields]
-        lines = [_idle(job, key, OF_SCENES[key.rpartition(".")[0]]) for key in keys]
-        lines.append(_idle(job, "render.tier", "a virtual capture has captures.simulate.tier"))
+        lines = []
+        for branch, instead in OF_SCENES.items():
+            why = "photographs show what they show" if job.captures.folders else f"a virtual capture has {instead}"
+            why = why if instead else "nothing falls in a capture"
+            names = ["tier"] if branch == "render" else type(_branch(job, branch)).model_fields
+            lines += [_idle(job, f"{branch}.{name}", why) for name in names]
     else:
         unmet = {key: next((phrase for phrase, acts in needs if not acts(job)), None) for key, needs in NEEDS.items()}
         lines = [_idle(job, key, why) for key, why in unmet.items() if why is not None]
