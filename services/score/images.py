@@ -170,10 +170,8 @@ BLOCK: Final = 8192
 def _sums_of(d: Array, t: Array, worst_m: float) -> Array:
     """The sums over pixels that `METRICS` are means of, squares in place of their root, of predicted and true depth [N]."""
     count = len(t)
-    if not (
-        d.min(initial=1.0) > 0.0 and d.max(initial=1.0) < np.inf
-    ):  # a hole is as far off as any, and beyond all ratios
-        hit = (d > 0.0) & (d < np.inf)
+    if not (d.min(initial=1.0) > 0.0 and d.max(initial=1.0) < np.inf):
+        hit = (d > 0.0) & (d < np.inf)  # a hole is as far off as any, and beyond all ratios
         d, t = d[hit], t[hit]
     holes = count - len(t)
     larger, smaller = np.maximum(d, t), np.minimum(d, t)

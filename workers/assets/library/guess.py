@@ -86,7 +86,7 @@ def guess_groups(items: Sequence[Item], doubles: Sequence[Item] = ()) -> list[Gr
 
 def _elsewhere(items: Sequence[Item]) -> Iterator[tuple[Item, Item, int]]:
     """(item of a format without units, the same thing in one that says metres, number of the unit in which both are as large)."""
-    metric = {home(item.path): item for item in items if item.suffix in METRIC.difference(POSED)}
+    metric = {home(item.path): item for item in items if item.suffix in METRIC and item.suffix not in POSED}
     for item in items:
         if item.suffix not in METRIC and item.measured.unit_m is None and (same := metric.get(home(item.path))):
             theirs = [(same.measured.unit_m or 1.0) * extent for extent in sorted(same.measured.extents)]
@@ -254,12 +254,14 @@ def _ups_elsewhere(items: Sequence[Item], every: Sequence[Item]) -> dict[str, tu
         shown = [up for up, theirs in known if _alike(ours, theirs)]
         if SPECIFIED_UP.get(same.suffix) == "y" and same.measured.stated_up is None and len(shown) == 1:
             votes.setdefault((item.suffix, home(item.path)[0]), Counter())[shown[0]] += 1
-    ups = dict[str, tuple[UpAxis, str]]()
-    for item in items:
-        for axis, count in votes.get((item.suffix, home(item.path)[0]), Counter[UpAxis]()).most_common(1):
-            if count >= AGREE * votes[item.suffix, home(item.path)[0]].total():
-                ups[item.path] = axis, f"as {count} of the same things in another format"
-    return ups
+    most = {place: (counts.most_common(1)[0], counts.total()) for place, counts in votes.items()}
+    shown_in = {
+        place: (axis, f"as {count} of the same things in another format")
+        for place, ((axis, count), total) in most.items()
+        if count >= AGREE * total
+    }
+    places = {item.path: (item.suffix, home(item.path)[0]) for item in items}
+    return {path: shown_in[place] for path, place in places.items() if place in shown_in}
 
 
 def _decide(items: Sequence[Item], specified: UpAxis | None) -> tuple[UpAxis, str]:

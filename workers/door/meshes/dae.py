@@ -24,6 +24,7 @@ from schemas.job.assets import UpAxis
 from schemas.scene.shape import Material
 from workers.door.meshes.posed import MOST_ABOVE, parse_tree
 from workers.door.meshes.raw import (
+    COMMAS,
     DEFAULT,
     WHITE,
     FolderResolver,
@@ -70,7 +71,7 @@ def read_dae(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
     """
     if _COMMA_UNIT.search(data):
         data = _COMMA.sub(b".", data)
-        resolver.notes.append("decimal commas were read as points")
+        resolver.notes.append(COMMAS)
     return list(_File(path, parse_tree(path, data, ["COLLADA"], "a COLLADA file"), resolver).meshes())
 
 

@@ -19,6 +19,7 @@ from schemas.base import Array
 from schemas.errors import MeshError
 from schemas.scene.shape import Material
 from workers.door.meshes.raw import (
+    COMMAS,
     DEFAULT,
     WHITE,
     FolderResolver,
@@ -153,7 +154,7 @@ class _Lines:
         if table.shape[1] < 3:
             raise MeshError("unreadable", f"{self.path} has a vertex of {table.shape[1]} numbers")
         if any("," in line for line in self.values["v"][:1]):
-            resolver.notes.append("decimal commas were read as points")
+            resolver.notes.append(COMMAS)
         colors = table[:, 3:6] if table.shape[1] == 6 else table[:, 4:7] if table.shape[1] == 7 else None
         if table.shape[1] == 7 and not (table[:, 3] == 1.0).all():
             colors = table[:, 3:6]  # r g b a; else x y z w r g b
@@ -250,9 +251,8 @@ def _mesh(
     """The mesh of triangles [T, 3, 4]: a vertex for each combination of point, coordinate and normal, in the file's order."""
     points, uv, normals = values
     corners = corners[np.argsort(corners[:, 0, 3], kind="stable"), :, :3]
-    textured = (
-        bool((corners[..., 1] >= 0).all()) and len(uv) > 0
-    )  # some programs number coordinates that they do not write
+    # Some programs number coordinates that they do not write.
+    textured = bool((corners[..., 1] >= 0).all()) and len(uv) > 0
     shaded = bool((corners[..., 2] >= 0).all()) and len(normals) > 0
     for used, kind, listed in ((textured, 1, uv), (shaded, 2, normals)):
         if used and corners[..., kind].max() >= len(listed):

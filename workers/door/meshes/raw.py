@@ -31,8 +31,9 @@ _UNDECODABLE = (OSError, ValueError, SyntaxError, Image.DecompressionBombWarning
 """What reading a stranger's picture may raise."""
 LONGEST_NAME = 1024
 """Letters of a file name that are looked at."""
+COMMAS = "decimal commas were read as points"
 UNPAINTED = "plain base colour used"
-"""The end of notes on pictures and materials that are left out."""
+"""A note on numbers, and the end of notes on pictures and materials that are left out."""
 
 MOST_NOTES = 20
 """Notes that are kept of an asset: they are stored in the dataset."""

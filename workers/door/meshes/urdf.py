@@ -152,19 +152,17 @@ def _origin(path: Path, element: ElementTree.Element) -> Pose:
     return np.eye(4) if origin is None else turned(path, origin.get("xyz", "0 0 0"), origin.get("rpy", "0 0 0"))
 
 
-_NOT_READ = ("submesh", "heightmap", "polyline")
-"""Shapes that an SDF may have."""
+_NOT_READ = {
+    **dict.fromkeys(("world", "include"), "init its models' own files"),
+    **dict.fromkeys(("submesh", "heightmap", "polyline"), "export it as one mesh"),
+}
+"""What an SDF may have and is not read, with the remedy."""
 
 
 def read_sdf(source: Source) -> Model:
     """The visuals of all links of an SDF's model, joints at zero."""
     path, root = source.path, source.parse(source.path, ["sdf"], "an SDF")
-    others = "init its models' own files"
-    for tag, remedy in {
-        "world": others,
-        "include": others,
-        **dict.fromkeys(_NOT_READ, "export it as one mesh"),
-    }.items():
+    for tag, remedy in _NOT_READ.items():
         if root.find(f".//{tag}") is not None:
             what = "is a world, and no object" if tag == "world" else f"has <{tag}>, which is not read"
             raise MeshError("format", f"{path} {what}: {remedy}")
