@@ -19,7 +19,7 @@ from backports import zstd
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from schemas.capture import DepthCamera
 from schemas.errors import CaptureError
@@ -179,7 +179,8 @@ def transform_message(T):
 
 
 COLOR, DEPTH = "/device_0/sensor_1/Color_0", "/device_0/sensor_0/Depth_0"
-INFO, IMAGE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Image"
+INFO, IMAGE, COMPRESSED = (f"sensor_msgs/msg/{name}" for name in ("CameraInfo", "Image", "CompressedImage"))
+VIDEO = "theora_image_transport/msg/Packet"
 
 
 def realsense(lens=(0.0,) * 5, model="Brown Conrady"):
@@ -211,6 +212,8 @@ def write_bag(path, said=None, compression="lz4", kind="bag"):
     for old in (path / "shot.bag", path / "shot"):
         shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
     ros1, ros2 = (get_typestore(store) for store in (Stores.ROS1_NOETIC, Stores.ROS2_HUMBLE))
+    for store in (ros1, ros2):
+        store.register(get_types_from_msg("std_msgs/Header header\nuint8[] data\n", VIDEO))
     if kind == "bag":
         writer = Writer1(path / "shot.bag")
         if compression != "none":
@@ -618,6 +621,90 @@ def test_a_rectified_image_has_the_camera_of_its_projection_matrix_and_no_lens(t
     assert np.array_equal(raw.depth.T_color_depth, np.eye(4))
 
 
+def compressed(us, form, data, frame):
+    return header(us, frame) + block(form) + block(data)
+
+
+def quantized(metres, nearest=0.1):
+    """As compressed_depth_image_transport has depth of 32FC1: codes a / depth + b, in 16 bits to 10 m."""
+    a = 100.0 * 101.0
+    b = 1.0 - a / 10.0
+    codes = np.where(metres > 0, a / np.maximum(metres, nearest) + b, 0)
+    return struct.pack("<iff", 0, a, b) + png(codes.astype(np.uint16))
+
+
+BEFORE = struct.pack("<iff", -1, 0.0, 0.0)
+PICTURES = {
+    "jpeg": ("compressed", [("rgb8; jpeg compressed bgr8", jpg(rgb)) for rgb in SMOOTH]),
+    "jpeg of a driver": ("compressed", [("jpeg", jpg(rgb)) for rgb in SMOOTH]),
+    "png in the order of rgb": ("compressed", [("rgb8; png compressed rgb8", png(bgr)) for bgr in BGR]),
+    "png": ("compressed", [("bgr8; png compressed bgr8", png(rgb)) for rgb in SMOOTH]),
+}
+DEPTH_CODES = {
+    "16 bits": ("compressedDepth", [("16UC1; compressedDepth png", BEFORE + png(mm)) for mm in DEPTH_MM]),
+    "16 bits of ROS 1": ("compressedDepth", [("16UC1; compressedDepth", BEFORE + png(mm)) for mm in DEPTH_MM]),
+    "quantized": ("compressedDepth", [("32FC1; compressedDepth png", quantized(m)) for m in DEPTH_M]),
+    "a picture": ("compressed", [("16UC1; png compressed ", png(mm)) for mm in DEPTH_MM]),
+}
+
+
+def transported(pictures, codes, also=()):
+    """A bag of realsense-ros as `record --all` has it, with images that image_transport compressed."""
+    said = published({name: DRIVERS["realsense"][name] for name in list(DRIVERS["realsense"])[::2]})
+    for topic, (transport, images) in zip(list(DRIVERS["realsense"])[::2], (pictures, codes), strict=True):
+        frame = DRIVERS["realsense"][topic][2]
+        said = [message for message in said if message[0] != topic or topic in also]
+        for us, (form, data) in zip(STAMPS_US, images, strict=True):
+            said.append((f"{topic}/{transport}", COMPRESSED, us, compressed(us, form, data, frame)))
+    return sorted(said, key=lambda message: message[2])
+
+
+@pytest.mark.parametrize("codes", DEPTH_CODES)
+@pytest.mark.parametrize("picture", PICTURES)
+def test_images_that_image_transport_compressed_are_those_it_was_given(picture, codes, tmp_path):
+    recording = open_any(write_bag(tmp_path, transported(PICTURES[picture], DEPTH_CODES[codes])))
+    color, depth = frames_of(recording)
+    assert recording.depth is None and [frame.stamp_us for frame in color + depth] == STAMPS_US * 2
+    for n in range(COUNT):
+        codes_off = np.abs(color[n].load(False).astype(int) - SMOOTH[n])
+        assert codes_off.max() <= (0 if "png" in picture else JPEG_CODES)
+        small = cv2.resize(cv2.cvtColor(SMOOTH[n], cv2.COLOR_RGB2GRAY), (W // 2, H // 2), interpolation=cv2.INTER_AREA)
+        assert np.corrcoef(color[n].load(True).ravel(), small.ravel())[0, 1] > 0.8
+        metres = DEPTH_MM[n] / 1000
+        assert np.abs(depth[n].load(False) - metres).max() <= (2e-3 if codes == "quantized" else 0)
+
+
+def test_of_an_image_in_several_ways_the_raw_one_is_taken_then_the_one_without_loss(tmp_path):
+    broken = ("compressed", [("16UC1; jpeg compressed ", jpg(SMOOTH[0]))] * COUNT)
+    raw, aligned = list(DRIVERS["realsense"])[::2]
+    said = transported(("compressed", [("jpeg", jpg(SMOOTH[0] * 0))] * COUNT), broken, also=(raw, aligned))
+    color, depth = frames_of(open_any(write_bag(tmp_path, said)))
+    assert np.array_equal(color[1].load(False), SMOOTH[1]) and len(color) == len(depth) == COUNT
+    said = [message for message in said if message[0] != aligned]
+    said += [m for m in transported(PICTURES["png"], DEPTH_CODES["16 bits"]) if "compressedDepth" in m[0]]
+    _, depth = frames_of(open_any(write_bag(tmp_path, sorted(said, key=lambda message: message[2]))))
+    assert np.array_equal(depth[2].load(False), DEPTH_MM[2] / 1000)
+
+
+def test_what_is_compressed_in_another_way_is_named(tmp_path):
+    for codes, told in (
+        (
+            ("compressedDepth", [("16UC1; compressedDepth rvl", BEFORE + bytes(99))] * COUNT),
+            "compressedDepth rvl', not one",
+        ),
+        (("compressed", [("16UC1; jpeg compressed ", jpg(SMOOTH[0]))] * COUNT), "jpeg compressed ', not one of mono16"),
+        (("compressed", [("png", b"no picture")] * COUNT), "has no images of depth"),
+    ):
+        refused(write_bag(tmp_path, transported(PICTURES["jpeg"], codes)), told)
+    said = transported(PICTURES["jpeg"], DEPTH_CODES["16 bits"])
+    video = ("/camera/color/image_raw/theora", VIDEO, STAMPS_US[0], header(0) + block(bytes(16)))
+    bag = write_bag(tmp_path, [video, *(m for m in said if "color/image_raw/" not in m[0] or "aligned" in m[0])])
+    refused(bag, "no images of colour; /camera/color/image_raw/theora is video .*: convert it to raw")
+    damaged = ("compressed", [*PICTURES["jpeg"][1][:2], ("jpeg", PICTURES["jpeg"][1][2][1][:300])])
+    color, _ = frames_of(open_any(write_bag(tmp_path, transported(damaged, DEPTH_CODES["16 bits"]))))
+    assert color[1].load(False) is not None
+
+
 def test_a_drivers_bag_needs_depth_registered_to_colour(tmp_path):
     color, raw, aligned, _ = DRIVERS["realsense"]
     with pytest.raises(CaptureError, match="aligned_depth_to_color of a RealSense or depth_to_rgb of an Azure Kinect"):
@@ -745,7 +832,7 @@ def test_hostile_bags_end_in_one_line(tmp_path):
         (realsense((0.1,) * 5, "Kannala Brandt4"), "lens 'Kannala Brandt4' with .* is not read"),
         (realsense((float("nan"),) * 5), "lens 'Brown Conrady' with"),
         (but("Color", change=lambda data: data.replace(b"rgb8", b"bay8")), "colour is 'bay8', not one of rgb8"),
-        (but("Color_0/image", "sensor_msgs/msg/CompressedImage"), "compressed: convert them"),
+        (but("Color_0/image", "sensor_msgs/msg/CompressedImage"), "no images of colour; it has /device_0"),
         (
             but("camera_info", change=lambda _: info(W, H, k=(float("nan"), FY, CX, CY))),
             "its intrinsics cannot be read",

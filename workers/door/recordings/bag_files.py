@@ -27,7 +27,7 @@ from workers.door.opening import as_refusal, open_file
 MOST_BYTES = 512_000_000
 """Of one chunk, unpacked."""
 
-IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+IMAGE, COMPRESSED, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 TRANSFORM, FLOAT, TEXT = "geometry_msgs/msg/Transform", "std_msgs/msg/Float32", "std_msgs/msg/String"
 
 ZSTD = b"\x28\xb5\x2f\xfd"
@@ -109,7 +109,7 @@ def is_bag(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class BagMessage:
-    """A message as stored; `content` decodes it."""
+    """A message as stored; `content` decodes it. A compressed image has the topic and the kind of the image itself."""
 
     topic: str
     kind: str
@@ -133,25 +133,47 @@ def open_files(path: Path) -> Iterator[list[tuple[_Kind, Any]]]:
         yield readers
 
 
+TRANSPORTS = ("/compressed", "/compressedDepth", "")
+"""What image_transport adds to the topic of an image that it compresses; the best of what a recorder may have of one last."""
+
+
 def read_messages(path: Path) -> Iterator[BagMessage]:
-    """The messages of the kinds that are read, in the order of time."""
+    """The messages of the kinds that are read, in the order of time, and of an image that is there more than once the best."""
     with open_files(path) as readers:
-        yield from heapq.merge(*(_of_file(*pair) for pair in readers), key=lambda message: message.stamp_us)
+        best: dict[str, tuple[bool, int]] = {}
+        for connection in (each for _, reader in readers for each in reader.connections):
+            if connection.msgtype in (IMAGE, COMPRESSED):
+                name, rank = _image_of(connection)
+                best[name] = max(best.get(name, rank), rank)
+        yield from heapq.merge(*(_of_file(*pair, best) for pair in readers), key=lambda message: message.stamp_us)
+
+
+def _image_of(connection: Any) -> tuple[str, tuple[bool, int]]:
+    """(topic of the image itself, how good this way of having it is: whether there is any, then the place in `TRANSPORTS`)."""
+    is_raw, has_any = connection.msgtype == IMAGE, connection.msgcount > 0
+    transport = "" if is_raw else next(end for end in TRANSPORTS if connection.topic.endswith(end))
+    place = len(TRANSPORTS) if is_raw else TRANSPORTS.index(transport)
+    return connection.topic.removesuffix(transport), (has_any, place)
 
 
 def _part(topic: str, kind: str) -> str:
-    """What a topic of a type is about: the type of its message in ROS 1; "" for what is not needed."""
+    """What a topic of a type is about: the type of its message in ROS 1, not compressed; "" for what is not needed."""
     if kind in (TEXT, INFO) and topic.endswith("/camera_info"):
         return INFO
     if kind in (TEXT, TRANSFORM) and "/tf/" in topic:
         return TRANSFORM
     if kind in (TEXT, FLOAT) and topic.replace("_", " ").endswith("/option/Depth Units/value"):
         return FLOAT
-    return IMAGE if kind == IMAGE else ""
+    return IMAGE if kind in (IMAGE, COMPRESSED) else ""
 
 
-def _of_file(kind: _Kind, reader: Any) -> Iterator[BagMessage]:
-    wanted = [connection for connection in reader.connections if _part(connection.topic, connection.msgtype)]
+def _of_file(kind: _Kind, reader: Any, best: dict[str, tuple[bool, int]]) -> Iterator[BagMessage]:
+    said: dict[int, tuple[str, str]] = {}
+    for each in reader.connections:
+        part, (name, rank) = _part(each.topic, each.msgtype), _image_of(each)
+        if part and (part != IMAGE or rank == best[name]):
+            said[each.id] = name if part == IMAGE else each.topic, part
+    wanted = [each for each in reader.connections if each.id in said]
     for connection, stamp_ns, data in reader.messages(wanted) if wanted else ():
         content = partial(kind.decode, bytes(data), connection.msgtype)
-        yield BagMessage(connection.topic, _part(connection.topic, connection.msgtype), stamp_ns // 1000, content)
+        yield BagMessage(*said[connection.id], stamp_ns // 1000, content)

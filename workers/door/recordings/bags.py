@@ -6,14 +6,14 @@ place of all but images: .../camera_info "width=...;ppx=...;model=...;coeffs=...
 column);translation=...". Drivers have a camera_info beside each topic of images.
 """
 
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,33 +23,9 @@ from schemas.errors import CaptureError
 from schemas.scene.view import Intrinsics
 from workers.door.opening import as_refusal
 from workers.door.recordings.bag_files import IMAGE, INFO, TRANSFORM, BagMessage, open_files, read_messages
+from workers.door.recordings.bag_images import COLORS, DEPTHS, PACKED, BagImage, read_image
 from workers.door.recordings.pictures import read_intrinsics
 from workers.geometry.frames import invert, pose, rotation_from_quaternion
-
-LONGEST_SIDE = 20_000
-"""Of an image, pixels."""
-
-COLORS = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
-PACKED = {
-    **dict.fromkeys(("yuyv", "YUYV", "yuv422_yuy2"), cv2.COLOR_YUV2RGB_YUY2),
-    **dict.fromkeys(("uyvy", "UYVY", "yuv422"), cv2.COLOR_YUV2RGB_UYVY),
-}
-"""OpenCV's conversions of encodings of colour, of 3 or 4 bytes a pixel and of 2; the SDK has capitals, or yuv422 for UYVY."""
-
-DEPTHS = {"mono16": "u2", "16UC1": "u2", "32FC1": "f4"}
-
-
-def _pixels(image: Any) -> NDArray:
-    """[H, W] or [H, W, C] of an Image in one of the encodings above. Raises ValueError or KeyError."""
-    height, width, step = image.height, image.width, image.step
-    if height * step != len(image.data) or not 0 < height <= LONGEST_SIDE or not 0 < width <= LONGEST_SIDE:
-        raise ValueError(f"an image of {width} x {height} in {len(image.data)} bytes")
-    rows = image.data.reshape(height, step)
-    if image.encoding in DEPTHS:
-        kind = np.dtype((">" if image.is_bigendian else "<") + DEPTHS[image.encoding])
-        return rows[:, : width * kind.itemsize].copy().view(kind).reshape(height, width)
-    channels = {**dict.fromkeys(COLORS, 3), "rgba8": 4, "bgra8": 4, **dict.fromkeys(PACKED, 2)}[image.encoding]
-    return np.ascontiguousarray(rows[:, : width * channels].reshape(height, width, channels))
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +123,13 @@ class _Stream:
         return is_same and bool(self.frame) and self.frame == color.frame and not self.topic.startswith(SDK)
 
 
+Kind = TypeVar("Kind")
+
 SDK = "/device_"
 """First part of the topics of the SDK, where `frame_id` says nothing."""
+
+VIDEO = re.compile("Packet|CompressedVideo")
+"""Types of messages of topics that are compressed as video: theora's, ffmpeg's, Foxglove's."""
 
 OTHERS = ("infra", "confidence", "fisheye", "/ir/", "body_index")
 """Of topics of images that are neither colour nor depth."""
@@ -166,10 +147,10 @@ class _Contents:
         topic = message.topic
         if message.kind == IMAGE:
             if not any(word in topic.lower() for word in OTHERS):
-                image = message.content()
-                stream = self.streams.setdefault(topic, _Stream(topic, image.encoding, image.header.frame_id))
+                image = read_image(message)
+                stream = self.streams.setdefault(topic, _Stream(topic, image.encoding, image.frame))
                 stream.stored_us.append(message.stamp_us)
-                stream.stamped_us.append(_stamped_us(image))
+                stream.stamped_us.append(image.stamp_us)
         elif message.kind == INFO:
             self.infos[topic.removesuffix("/camera_info").removesuffix("/info")] = _info(message.content())
         elif message.kind == TRANSFORM:
@@ -190,17 +171,11 @@ class _Contents:
                 stream.T_stream_ref, stream.reference = self.transforms[place], place.rpartition("/")[2]
 
 
-def _stamped_us(image: Any) -> int:
-    stamp = image.header.stamp
-    return int(stamp.sec) * 1_000_000 + int(stamp.nanosec) // 1000
-
-
 def open_bag(path: Path) -> Recorded:
     """The recording of a bag. Raises CaptureError that says what it holds and what is missing."""
     contents = _Contents()
     for message in read_messages(path):
-        with suppress(CaptureError), as_refusal(message.topic, CaptureError):  # a damaged message is passed over
-            contents.take(message)
+        _or_none(contents.take, message.topic, message)
     contents.describe()
     color, depth, others = _pair(path, contents)
     color_camera, depth_camera = _cameras(path, color, depth, contents.units_per_m)
@@ -211,12 +186,10 @@ def open_bag(path: Path) -> Recorded:
     def frames() -> Iterator[RecordedFrame]:
         for message in read_messages(path):
             if message.topic in (color.topic, depth.topic):
-                stream, stamp_us = depth if message.topic == depth.topic else color, message.stamp_us
-                if is_stamped:
-                    with suppress(CaptureError), as_refusal(message.topic, CaptureError):
-                        stamp_us = _stamped_us(message.content())
-                load = partial(_load, message, stream, contents.units_per_m)
-                yield RecordedFrame(stream is depth, stamp_us, load)
+                stream = depth if message.topic == depth.topic else color
+                image = _or_none(read_image, message.topic, message)
+                stamp_us = image.stamp_us if is_stamped and image else message.stamp_us
+                yield RecordedFrame(stream is depth, stamp_us, partial(_load, image, stream, contents.units_per_m))
 
     clock = max(period, 1.0), frames, float(stamps[-1])
     notes = (f"{color.topic} is taken with {depth.topic}, and {', '.join(others)} left out",) if others else ()
@@ -248,11 +221,10 @@ def _pair(path: Path, contents: _Contents) -> tuple[_Stream, _Stream, list[str]]
     for name, streams in (("colour", colors), ("depth", depths)):
         if not streams:
             with open_files(path) as readers:
-                kinds = {each.topic: each.msgtype for _, reader in readers for each in reader.connections}
-            packed = any("CompressedImage" in kind for kind in kinds.values())
-            why = "its images are compressed: convert them (rosrun image_transport republish compressed raw)"
-            topics = ", ".join(sorted(topic for topic, kind in kinds.items() if "Image" in kind))
-            more = why if packed else f"it has {topics or 'no topic of images'}"
+                kinds = sorted((each.topic, each.msgtype) for _, reader in readers for each in reader.connections)
+            video = next((f"{topic} is video ({kind})" for topic, kind in kinds if VIDEO.search(kind)), "")
+            images = ", ".join(topic for topic, kind in kinds if "Image" in kind) or "no topic of images"
+            more = f"{video}: convert it to raw (image_transport republish)" if video else f"it has {images}"
             raise CaptureError(name, f"{path} has no images of {name}; {more}")
 
     def rank(pair: tuple[_Stream, _Stream]) -> tuple[bool, bool, int]:
@@ -266,7 +238,7 @@ def _pair(path: Path, contents: _Contents) -> tuple[_Stream, _Stream, list[str]]
     for name, stream in (("colour", color), ("depth", depth)):
         usable = (*COLORS, *PACKED) if name == "colour" else tuple(DEPTHS)
         if stream.encoding not in usable:
-            wanted = f"not one of {', '.join(usable)}: record it as one of those"
+            wanted = f"not one of {', '.join(usable)}: record it as one of those, raw or compressed without loss"
             raise CaptureError("format", f"{path}: {name} is {stream.encoding!r:.60}, {wanted}")
         if stream.info is None and not is_registered:
             raise CaptureError("calibration", f"{path} has no camera_info for {stream.topic}: record it as well")
@@ -314,24 +286,24 @@ def _lens(path: Path, info: _Info) -> Array:
     return frozen_array(np.append(info.D[:8], np.zeros(8))[:8])
 
 
-def _load(message: BagMessage, stream: _Stream, units_per_m: float, small: bool) -> NDArray | None:
+def _load(image: BagImage | None, stream: _Stream, units_per_m: float, small: bool) -> NDArray | None:
     """As `RecordedFrame.load`."""
-    image = pixels = None
-    with suppress(CaptureError), as_refusal(message.topic, CaptureError):
-        image = message.content()
-        pixels = _pixels(image)
-    if image is None or pixels is None or image.encoding != stream.encoding:
+    if (
+        image is None
+        or image.encoding != stream.encoding
+        or (stream.info is not None and image.size != stream.info.size)
+    ):
         return None
-    if stream.info is not None and pixels.shape[1::-1] != stream.info.size:
-        return None
-    if not stream.is_color:
-        scale = units_per_m if image.encoding != "32FC1" else 1.0
-        depth = np.nan_to_num(pixels.astype(np.float64) / scale, nan=0.0, posinf=0.0, neginf=0.0)
-        return depth if not small else np.zeros(0)
-    conversion = {**COLORS, **PACKED}[image.encoding]
-    rgb = pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))
-    if not small:
-        return rgb
-    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    half = (rgb.shape[1] // 2, rgb.shape[0] // 2)
-    return np.asarray(cv2.resize(gray, half, interpolation=cv2.INTER_AREA), np.uint8)
+    pixels = _or_none(image.load, stream.topic, small)
+    if pixels is None or stream.is_color:
+        return pixels
+    scale = units_per_m if image.encoding != "32FC1" else 1.0
+    depth = np.nan_to_num(pixels.astype(np.float64) / scale, nan=0.0, posinf=0.0, neginf=0.0)
+    return depth if not small else np.zeros(0)
+
+
+def _or_none(read: Callable[..., Kind], topic: str, *given: Any) -> Kind | None:
+    """What is read of a message; None where it is damaged."""
+    with suppress(CaptureError), as_refusal(topic, CaptureError):
+        return read(*given)
+    return None

@@ -33,7 +33,7 @@ from workers.door.recordings.pictures import (
     decode_depth,
     decode_rgb,
     decode_small,
-    head_size,
+    read_head,
     read_intrinsics,
     scaled_camera,
 )
@@ -71,7 +71,7 @@ def _tree_of(path: Path, read: Read | None = None) -> Any:
 def _size_of(path: Path) -> Size:
     """Width and height in the head of an image. Raises CaptureError."""
     with as_refusal(path, CaptureError):
-        return head_size(_bytes_of(path))
+        return read_head(_bytes_of(path))[0]
 
 
 Seen = Intrinsics | Size

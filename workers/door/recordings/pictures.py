@@ -36,13 +36,13 @@ class PictureError(ValueError):
     """A picture that cannot be used; the message has no name of the file, which the caller knows."""
 
 
-def head_size(data: bytes) -> Size:
-    """Width and height in the head of an image, of which nothing else is read. Raises PictureError."""
+def read_head(data: bytes) -> tuple[Size, str]:
+    """(width and height, Pillow's mode) in the head of an image, of which nothing else is read. Raises PictureError."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the size is what is asked for
         try:
             with Image.open(io.BytesIO(data)) as image:
-                return image.size
+                return image.size, image.mode
         except Image.DecompressionBombError as error:
             raise PictureError("is an image of more pixels than any camera has") from error
         except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
@@ -50,22 +50,23 @@ def head_size(data: bytes) -> Size:
 
 
 def _check_size(data: bytes, size: Size) -> None:
-    stated = head_size(data)
+    stated, _ = read_head(data)
     if stated != size:
         raise PictureError(f"is {stated[0]} x {stated[1]}, and its camera has {size[0]} x {size[1]}")
 
 
 def decode_rgb(data: bytes, size: Size) -> NDArray[np.uint8]:
     """[H, W, 3] uint8 sRGB of a PNG or JPEG of a size, as it is stored, not turned. Raises PictureError."""
-    return np.asarray(_decode(data, size, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION), np.uint8)
+    return np.asarray(decode_picture(data, size, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION), np.uint8)
 
 
 def decode_small(data: bytes, size: Size) -> NDArray[np.uint8]:
     """[H / 2, W / 2] uint8 grey, fast: what sharpness and movement are measured on. Raises PictureError."""
-    return np.asarray(_decode(data, size, cv2.IMREAD_REDUCED_GRAYSCALE_2), np.uint8)
+    return np.asarray(decode_picture(data, size, cv2.IMREAD_REDUCED_GRAYSCALE_2), np.uint8)
 
 
-def _decode(data: bytes, size: Size, flags: int) -> NDArray:
+def decode_picture(data: bytes, size: Size, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray:
+    """The pixels as OpenCV reads them. Raises PictureError, before it decodes where the size is another."""
     _check_size(data, size)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -89,7 +90,7 @@ def decode_depth(data: bytes, size: Size, units_per_m: float) -> Array:
     elif kind == "raw":
         stored = _load_raw(data, size)
     else:
-        stored = _decode(data, size, cv2.IMREAD_UNCHANGED)
+        stored = decode_picture(data, size)
     if stored.ndim != 2 or stored.dtype not in (np.uint16, np.float32, np.float64):
         channels = 1 if stored.ndim == 2 else stored.shape[2]
         raise PictureError(f"is {stored.dtype} with {channels} channels: depth has one, of 16 bits or floating point")
@@ -100,7 +101,7 @@ def decode_depth(data: bytes, size: Size, units_per_m: float) -> Array:
 def decode_confidence(data: bytes, size: Size) -> NDArray[np.uint8]:
     """[H, W] uint8 of a PNG or of bytes, as they are or compressed by LZFSE; 0: the lowest. Raises PictureError."""
     if data.startswith(b"\x89PNG"):
-        return np.asarray(_decode(data, size, cv2.IMREAD_GRAYSCALE), np.uint8)
+        return np.asarray(decode_picture(data, size, cv2.IMREAD_GRAYSCALE), np.uint8)
     data = _expand(data, size[0] * size[1]) if data[:4] in LZFSE else data
     if len(data) != size[0] * size[1]:
         raise PictureError(f"has a confidence of {len(data)} bytes, and its depth is {size[0]} x {size[1]}")
