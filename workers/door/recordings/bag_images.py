@@ -1,7 +1,8 @@
 """The images of bags as arrays: raw in any usual encoding, or compressed by image_transport.
 
 sensor_msgs/CompressedImage has the format "ENCODING; CODEC compressed COLOURS" or "ENCODING; compressedDepth CODEC". Before the
-PNG of compressedDepth are an int32 and two float32, a and b: where ENCODING is 32FC1, depth is a / (code - b) metres, 0 is none.
+PNG of compressedDepth are an int32 and two float32, a and b: where ENCODING is 32FC1, a code is a / metres + b cut to a whole
+number, and 0 is none. Old ones have the format "ENCODING" alone.
 """
 
 from collections.abc import Callable
@@ -85,7 +86,7 @@ def _read_compressed(image: Any) -> tuple[str, Size, Callable[[bool], NDArray]]:
     """As `_read_raw`; an encoding that cannot be used is the whole format, for the message that refuses it."""
     said, data = image.format, image.data.tobytes()
     raw, _, codec = (part.strip() for part in said.partition(";"))
-    if "compressedDepth" in codec:
+    if "compressedDepth" in codec or (said in DEPTHS and data[QUANTIZED.itemsize :].startswith(b"\x89PNG")):
         if raw not in DEPTHS or "rvl" in codec:
             return said, (0, 0), lambda _: np.zeros(0)
         size, mode = read_head(data[QUANTIZED.itemsize :])
@@ -111,4 +112,4 @@ def _load_depth(data: bytes, size: Size, is_quantized: bool, small: bool) -> NDA
         return codes
     head = np.frombuffer(data, QUANTIZED, 1)[0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(codes > 0, head["a"] / (codes.astype(np.float64) - head["b"]), 0.0)
+        return np.where(codes > 0, head["a"] / (codes + 0.5 - head["b"]), 0.0)
