@@ -22,6 +22,7 @@ from schemas.errors import VersoError
 from tests.kit.crash_states import Disk, losses, recorded, write_tree
 from tests.kit.faults import Fault, Killed, requests
 from tests.kit.made_up_runs import FIRST, RANGE, STOP, broken_promises, contents, leftovers, make_dataset, settings_of
+from tests.kit.tiers import first_of
 from tests.made_up_scenes import attempt_at, failed_scene, small_scene
 from workers.store import attempt as attempt_module
 from workers.store.local import LocalStore
@@ -196,7 +197,7 @@ def keys_of(store: ObjectStore) -> set[str]:
 @pytest.mark.timeout(3600)
 @pytest.mark.usefixtures("unflushed", "killed_files_are_closed")
 @pytest.mark.parametrize("fault", ["killed before", "answer lost"])
-@pytest.mark.parametrize("name", REQUESTED)
+@pytest.mark.parametrize("name", first_of(REQUESTED, 2))
 def test_ended_at_a_request_and_started_again_it_makes_the_same_dataset(name, fault: Fault, tmp_path, request):
     program = REQUESTED[name]
     held = MemoryStore()

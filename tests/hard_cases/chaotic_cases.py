@@ -279,6 +279,7 @@ CHAOTIC = (
         on_a_face(),  # one that bounces on an edge
         lambda seed: nudged(drop(cube(0.005), ring(0.001), 1.0, xy=(0.45, 0.0)), seed),
         tier="slow",
+        first="minute",
     ),
     Chaotic(
         "cube of 1 m, nudged",

@@ -124,7 +124,9 @@ STACKS = (
         heights(*(0.03 * k + 0.015 for k in range(4))),
         lambda: stairs(0.95),
     ),
-    settles("four bricks over one another by 105 % of what balances", below(0.09, 3), lambda: stairs(1.05)),
+    settles(
+        "four bricks over one another by 105 % of what balances", below(0.09, 3), lambda: stairs(1.05), tier="minute"
+    ),
     settles("six cubes in a pyramid", heights(*[S / 2] * 3, *[1.5 * S] * 2, 2.5 * S, bound_mm=0.05), pyramid_of_cubes),
     settles("five balls in a pyramid in a tray", balls_up(2), partial(pyramid_of_balls, 2), again="slow"),
     settles("fourteen balls in a pyramid in a tray", balls_up(3), partial(pyramid_of_balls, 3), tier="slow"),

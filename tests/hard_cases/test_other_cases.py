@@ -21,8 +21,11 @@ OF_SECONDS = {
         "small marker",
         "three markers in one view",
     ),
+    *("no depth on the object", "no depth on the board at all", "an object of 4 mm", "no depth on the markers"),
+    *("an object of 4 mm below a clearance of 6 mm", "one marker in every view", "one view out of focus"),
+    *("over-exposed, white at 255", "all views a little out of focus", "no depth anywhere"),
 }
-"""Cases of two seconds and more, of which the default suite has one or two of each kind."""
+"""Cases that take longest, of which the default suite has one or two of each kind."""
 
 
 def rows(cases):
