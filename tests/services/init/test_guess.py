@@ -187,6 +187,7 @@ COPIES = {
     "butter/food.xml": (),
     "ur5/visual/base.dae": ("ur5/collision/base.obj",),
     "car_LOD0.glb": ("car_LOD1.glb", "car_LOD2.glb"),
+    "tea/model.urdf": ("tea/collision.obj", "tea/Collision_Mesh.stl"),
     "jar.obj": ("jar_lod1.obj", "UCX_jar_01.obj"),
     "lamp_lod2.obj": ("lamp_lod3.obj",),
     "bun_zipper.ply": ("bun_zipper_res2.ply",),
@@ -200,6 +201,8 @@ ORIGINALS = (
     "x/coll/mug.obj",
     "free_hull.obj",
     "mocha-col1.obj",
+    "hull.obj",
+    "boxes/collision.obj",
 )
 
 

@@ -98,6 +98,8 @@ def test_a_body_with_a_look_has_its_picture_or_colour_and_one_without_coordinate
     rgba="1 1 0.5 0.5"/></asset><worldbody><geom type="mesh" mesh="{}" {}/></worldbody></mujoco>"""
     flat = '<texture type="2d" file="green.png"/>'
     about = '<texture type="cube" name="green" file="green.png"/>'
+    sides = '<texture type="cube" name="green" file="green.png" gridsize="3 4" gridlayout=".U..LFRB.D.."/>'
+    drawn = '<texture name="green" builtin="{}" rgb1="0.2 0.4 0.6" rgb2="0.6 0 0.6" width="9" height="9"/>'
     sdf = """<sdf><model><link><visual><geometry><mesh><uri>model://any/m/plain.obj</uri></mesh></geometry><material>
     <diffuse>0 0 1</diffuse></material></visual></link></model></sdf>"""
     of_urdf = urdf(
@@ -107,7 +109,23 @@ def test_a_body_with_a_look_has_its_picture_or_colour_and_one_without_coordinate
     bare = textured_obj()["cube.obj"].replace(b"mtllib cube.mtl\n", b"").replace(b"usemtl skin\n", b"")
     for name, text, colour, green, note in (
         ("a.xml", assets.format("cube", flat, "cube", 'material="k"'), (1.0, 1.0, 0.5, 0.5), True, ""),
-        ("b.xml", assets.format("cube", about, "cube", 'material="k" rgba="1 0 0 1"'), (1.0, 0.0, 0.0, 1.0), False, ""),
+        ("b.xml", assets.format("cube", about, "cube", 'material="k" rgba="1 0 0 1"'), (1.0, 0.0, 0.0, 1.0), True, ""),
+        ("f.xml", assets.format("plain", about, "plain", 'material="k"'), (1.0, 1.0, 0.5, 0.5), True, ""),
+        ("g.xml", assets.format("plain", sides, "plain", 'material="k"'), (1.0, 1.0, 0.5, 0.5), False, ""),
+        (
+            "h.xml",
+            assets.format("plain", drawn.format("flat"), "plain", 'material="k"'),
+            (0.2, 0.4, 0.3, 0.5),
+            False,
+            "",
+        ),
+        (
+            "i.xml",
+            assets.format("plain", drawn.format("checker"), "plain", 'material="k"'),
+            (0.4, 0.2, 0.3, 0.5),
+            False,
+            "",
+        ),
         (
             "c.xml",
             assets.format("plain", flat, "plain", 'material="k"'),
@@ -129,7 +147,25 @@ def test_a_body_with_a_look_has_its_picture_or_colour_and_one_without_coordinate
         )
         assert note in "; ".join(loaded.notes), name
         meshes, pictures = list_seen(path, tmp_path, LIMITS)
-        assert len(meshes) == 1 and len(pictures) == (name in ("a.xml", "c.xml", "e.urdf"))
+        assert len(meshes) == 1 and len(pictures) == (name[0] in "abcef")
+
+
+@pytest.mark.parametrize("body", ['type="mesh" mesh="m"', 'size="1.5"', 'type="cylinder" size="1 2"'], ids=str.split)
+def test_a_picture_without_coordinates_of_its_own_lies_on_six_sides_once_and_not_mirrored(body, tmp_path):
+    write(tmp_path / "m.obj", CUBE)
+    write(tmp_path / "green.png", picture(colour=(0, 200, 0)))
+    asset = '<mesh file="m.obj"/><texture name="t" file="green.png"/><material name="k" texture="t"/>'
+    world = f'<worldbody><geom pos="5 0 0" {body} material="k"/></worldbody>'
+    path = write(tmp_path / "a.xml", f"<mujoco><asset>{asset}</asset>{world}</mujoco>")
+    (part,) = load_posed(path, LIMITS, tmp_path).shape.parts
+    corners, uv = part.vertices[part.faces], part.uv[part.faces]
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    assert (a[:, 0] * b[:, 1] > a[:, 1] * b[:, 0]).mean() > 0.95, "not mirrored; few faces bend away from their side"
+    assert part.uv.min() >= 0.0 and part.uv.max() <= 1.0 and np.ptp(part.uv, axis=0).min() > 0.7
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lateral = np.abs(normal[:, 2]) < 0.1 * np.linalg.norm(normal, axis=1)
+    up = np.polyfit(corners[lateral][..., 2].ravel(), uv[lateral][..., 1].ravel(), 1)
+    assert lateral.any() and up[0] > 0.0, "upright on the sides"
 
 
 SCRIPTED = """<sdf><model><link><visual><geometry>{}</geometry><material><script><uri>model://m/materials/scripts</uri>
@@ -285,7 +321,30 @@ def test_an_mjcf_is_read_with_what_it_includes_as_mujoco_has_it(tmp_path):
     assert files - {"a.xml"} == {file.name for file in list_named(path, tmp_path, LIMITS)}, "parts, and no objects"
 
 
+@pytest.mark.parametrize("joint", ["<freejoint/>", '<joint type="free"/>'])
+def test_of_an_mjcf_s_world_the_one_body_that_moves_freely_is_the_object(tmp_path, joint):
+    alone = f"""<body pos="0 0 0.5" euler="0 0 30">{joint}<geom type="box" size="0.1 0.2 0.3"/>
+        <body pos="1 0 0"><joint/><geom type="box" size="0.1 0.1 0.1"/></body></body>"""
+    table = """<geom type="plane" size="1 1 1"/><geom type="box" size="1 1 0.1"/>
+        <body><geom type="box" size="3 3 0.1"/><body><joint/><geom type="box" size="2 2 2"/></body></body>"""
+    bare = write(tmp_path / "bare.xml", f"<mujoco><worldbody>{alone}</worldbody></mujoco>")
+    write(tmp_path / "table.xml", f"<mujoco><worldbody>{table}</worldbody></mujoco>")
+    for name, inside in (("around", table + alone), ("frame", f'<frame pos="0 0 0">{alone}<geom size="1"/></frame>')):
+        path = write(tmp_path / f"{name}.xml", f"<mujoco><worldbody>{inside}</worldbody></mujoco>")
+        ours = load_posed(path, LIMITS, tmp_path)
+        assert np.allclose(boxes(ours.shape), seen_by_mujoco(bare, group=0)) and len(ours.shape.parts) == 2
+        assert ours.notes == ("only its free body is used, and not the world around it",)
+    assert load_posed(bare, LIMITS, tmp_path).notes == ()
+    assert len(load_posed(tmp_path / "table.xml", LIMITS, tmp_path).shape.parts) == 3
+
+
 WRONG = (
+    (
+        "a.xml",
+        f"<mujoco><worldbody>{'<body><freejoint/><geom/></body>' * 2}</worldbody></mujoco>",
+        "format",
+        "is a world of 2 bodies that move freely, and no object: write each into a file of its own",
+    ),
     ("a.sdf", "<sdf><world><model/></world></sdf>", "format", "is a world, and no object"),
     (
         "a.sdf",

@@ -229,6 +229,11 @@ def test_links_stand_where_their_joints_put_them(tmp_path):
     assert middles == pytest.approx(np.array([[0, 0, 0], [0, 0, 2], [0, -2, 2]]), abs=1e-12)
 
 
+def test_numbers_of_a_urdf_may_have_commas_between_them_as_robots_parsers_let_them(tmp_path):
+    part = load_body(tmp_path, urdf(visual('<box size="1.0, 2.0, 3"/>'))).parts[0]
+    assert np.ptp(part.vertices, axis=0) == pytest.approx([1.0, 2.0, 3.0])
+
+
 def test_the_colour_of_the_urdf_goes_on_what_brings_none(tmp_path):
     own, named = '<material name="m"><color rgba="1 0.2 0 1"/></material>', '<material name="m"/>'
     box = '<box size="1 1 1"/>'

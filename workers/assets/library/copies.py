@@ -50,6 +50,8 @@ _COLLIDES = "col|coll|collisions?|colliders?|v-?hacd|coacd|convex|hulls?|ch|phys
 _NAMED = re.compile(rf"(.+?)(?:[\s_.-]+(?:{_COLLIDES})(?:[\s_.-]*\d+)*)+", re.IGNORECASE)
 _NAMED_BEFORE = re.compile(r"(?:UCX|UBX|USP|UCP)_(.+?)(?:_\d+)?")
 """As Unreal has it."""
+_ALONE = re.compile(r"(?:collisions?|colliders?|v-?hacd|coacd)(?:[\s_.-]*(?:mesh|model))?", re.IGNORECASE)
+"""A name that says nothing else."""
 _FOLDER = re.compile(rf"(?:{_COLLIDES})(?:[\s_.-]*mesh(?:es)?)?", re.IGNORECASE)
 _LEVEL = re.compile(r"(.+?)(?:[\s_.-]*lod|[\s_.-]+res)[\s_.-]*(\d+)", re.IGNORECASE)
 """Also as Stanford's scans have it: bun_zipper_res2."""
@@ -106,6 +108,8 @@ def _split(path: str) -> tuple[str, int | None]:
         return match[1], int(match[2])
     if match := _NAMED.fullmatch(stem) or _NAMED_BEFORE.fullmatch(PurePosixPath(path).stem):
         return match[1].lower(), -1
+    if _ALONE.fullmatch(stem):
+        return "", -1
     return (stem, -1) if _in_folder(path) else (stem, None)
 
 

@@ -244,8 +244,9 @@ def _guess_rows(source: Path, making: Making, watch: Watch) -> list[Row]:
     every = max(1, -(-len(asked) // SAMPLE)) if len(asked) > MOST_READ else 1
     surveys = survey_folder(source, asked[::every], making.limits, kept, watch)
     for survey in surveys:
-        for part in set(survey.named) & set(asked):
-            left_out.setdefault(part, LeftOut(part, PART, f"part of {survey.path}"))
+        for part in set(survey.named) & set(paths):
+            if copies.pop(part, None) or part not in left_out:  # a file that names it is surer than its name
+                left_out[part] = LeftOut(part, PART, f"part of {survey.path}")
     licences = list_licences(source)
     is_large = every > 1
     rows = _apply_sample(source, asked, surveys, making) if is_large else _decide(surveys, left_out, making)

@@ -48,7 +48,10 @@ class _Document:
 
 
 def read_mjcf(source: Source) -> Model:
-    """The geoms of an MJCF's bodies that are seen, joints at zero, in the frame of the world, metres."""
+    """The geoms of an MJCF's bodies that are seen, joints at zero, in the frame of the world, metres.
+
+    Of a file with one body that moves freely only that: what is around it is its world. MeshError `format` where several do.
+    """
     path, root = source.path, source.parse(source.path, ["mujoco"], "an MJCF")
     _include(source, root, 0)
     for tag in NOT_READ:
@@ -56,6 +59,7 @@ def read_mjcf(source: Source) -> Model:
             raise MeshError(
                 "format", f"{path} has <{tag}>, which is not read: write the whole model with MuJoCo's mj_saveLastXML"
             )
+    _leave_out_world(source, root)
     compiler = {name: value for item in root.iterfind("compiler") for name, value in item.attrib.items()}
     defaults = {"": dict[str, Attributes]()}
     for top in root.iterfind("default"):
@@ -85,6 +89,25 @@ def _include(source: Source, element: Node, depth: int) -> None:
             element[number : number + 1] = list(included)
         else:
             _include(source, child, depth + 1)
+
+
+def _leave_out_world(source: Source, root: Node) -> None:
+    """Takes out what is around the body that moves freely, which may be in a <frame> and in no other body."""
+    tops = [top for world in root.iterfind("worldbody") for top in (world, *world.iterfind(".//frame"))]
+    bodies = [(top, body) for top in tops for body in top.iterfind("body")]
+    free = [
+        body for _, body in bodies if body.find("freejoint") is not None or body.find("joint[@type='free']") is not None
+    ]
+    if len(free) > 1:
+        what = f"is a world of {len(free)} bodies that move freely, and no object: write each into a file of its own"
+        raise MeshError("format", f"{source.path} {what}")
+    if free:
+        around = [(top, body) for top, body in bodies if body is not free[0]]
+        around += [(top, geom) for top in tops for geom in top.iterfind("geom") if geom.get("type") != "plane"]
+        for top, element in around:
+            top.remove(element)
+        if around:
+            source.notes.append("only its free body is used, and not the world around it")
 
 
 def _add_defaults(
@@ -133,13 +156,13 @@ def _seen(document: _Document, body: Node, T: Pose, of_body: str, depth: int) ->
 
 def _visual(document: _Document, geom: Attributes, T: Pose, meshes: Mapping[str, Node]) -> Visual | None:
     """What a geom shows; None for a plane, a height field, and what is quite transparent."""
-    colour, texture = _look(document, geom)
+    colour, texture, by_side = _look(document, geom)
     kind = "mesh" if "mesh" in geom else geom.get("type", "sphere")
     if kind in ("plane", "hfield", "sdf") or (colour is not None and colour[3] == 0.0):
         return None
     if kind != "mesh":
         return Visual(
-            T, body=make_body(document.path, kind, _sizes(document, geom, kind)), colour=colour, texture=texture
+            T, None, make_body(document.path, kind, _sizes(document, geom, kind)), colour, texture, by_side=by_side
         )
     mesh = meshes.get(geom.get("mesh", ""))
     if mesh is None or not mesh.get("file"):
@@ -149,24 +172,34 @@ def _visual(document: _Document, geom: Attributes, T: Pose, meshes: Mapping[str,
         _rotation(document.numbers(given, "refquat", "1 0 0 0")), document.numbers(given, "refpos", "0 0 0")
     )
     T = T @ scaled(document.path, document.numbers(given, "scale", "1 1 1")) @ np.linalg.inv(reference)
-    return Visual(T, _file_of(document, mesh, "meshdir"), None, colour, texture, dresses=True)
+    return Visual(T, _file_of(document, mesh, "meshdir"), None, colour, texture, True, by_side)
 
 
-def _look(document: _Document, geom: Attributes) -> tuple[Array | None, str | None]:
-    """The colour and the picture of a geom: those of its material, or its own colour."""
+def _look(document: _Document, geom: Attributes) -> tuple[Array | None, str | None, bool]:
+    """The colour and the picture of a geom, those of its material or its own colour, and whether the picture is on six sides.
+
+    Of what MuJoCo draws itself the mean colour; a picture of several sides is not read.
+    """
     material = _asset(document, "material", geom.get("material"))
     rgba = numbers(document.path, geom["rgba"], 4) if "rgba" in geom else None
     if material is None:
-        return (None if rgba is None else np.clip(rgba, 0.0, 1.0)), None
+        return (None if rgba is None else np.clip(rgba, 0.0, 1.0)), None, False
     given = document.attributes(material, "")
     layers = [
         layer.get("texture") for layer in material.iterfind("layer") if layer.get("role", "rgb") in ("rgb", "rgba")
     ]
     texture = _asset(document, "texture", given.get("texture") or next(iter(layers), None))
-    # A picture of another type than 2d is put on by direction, and not by the mesh's coordinates.
-    flat = texture is not None and texture.get("type", "cube") == "2d" and texture.get("file")
     colour = np.clip(rgba if rgba is not None else document.numbers(given, "rgba", "1 1 1 1"), 0.0, 1.0)
-    return colour, _file_of(document, texture, "texturedir") if texture is not None and flat else None
+    if texture is None or "gridsize" in texture.attrib:
+        return colour, None, False
+    drawn = texture.get("builtin", "none")
+    if drawn != "none":
+        one, two = (
+            document.numbers(texture.attrib, *word) for word in (("rgb1", "0.8 0.8 0.8"), ("rgb2", "0.5 0.5 0.5"))
+        )
+        return colour * [*np.clip(one if drawn == "flat" else 0.5 * (one + two), 0.0, 1.0), 1.0], None, False
+    named = _file_of(document, texture, "texturedir") if texture.get("file") else None
+    return colour, named, named is not None and texture.get("type", "cube") == "cube"
 
 
 def _asset(document: _Document, tag: str, name: str | None) -> Node | None:

@@ -35,7 +35,8 @@ class Visual:
     """One thing that a file poses: a mesh by the name of its file, or a simple body.
 
     T: affine, [4, 4], to the frame of the whole, metres; colour: sRGB and alpha; texture: the name of a picture; dresses:
-    whether these replace what the mesh has of its own, and are not only for what has none.
+    whether these replace what the mesh has of its own, and are not only for what has none; by_side: whether the picture is on
+    each of six sides, by direction, and not by the mesh's coordinates.
     """
 
     T: Pose
@@ -44,6 +45,7 @@ class Visual:
     colour: Array | None = None
     texture: str | None = None
     dresses: bool = False
+    by_side: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,21 +150,34 @@ def make_body(path: Path, kind: str, sizes: Array) -> Part:
     return Part(kind, frozen_array(mesh.vertices), frozen_array(mesh.faces, np.int32), DEFAULT)
 
 
-def wrap_body(part: Part) -> Part:
-    """The simple body with coordinates of a picture: once on each flat side, once around a round one; seen from outside, z up."""
-    corners, size = part.vertices[part.faces], np.ptp(part.vertices, axis=0)
+def wrap_body(part: Part, by_side: bool = False) -> Part:
+    """The simple body with coordinates of a picture: once on each flat side, once around a round one; seen from outside, z up.
+
+    by_side: once on each of six sides, whatever the body is; a face is on that which it is nearest to from the middle.
+    """
+    corners, size = part.vertices[part.faces], np.ptp(part.vertices, axis=0).clip(1e-12)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    if by_side:
+        corners = corners - part.vertices.min(axis=0) - 0.5 * size
+        normal = corners.mean(axis=1) / size
     axis = np.abs(normal).argmax(axis=1)
     up = np.eye(3)[np.where(axis == 2, 1, 2)]
     right = np.cross(up, np.eye(3)[axis] * np.sign(np.take_along_axis(normal, axis[:, None], axis=1)))
     around = np.arctan2(corners[..., 1], corners[..., 0]) / (2.0 * np.pi) + 0.5
     around += (around < 0.5) & (np.ptp(around, axis=1, keepdims=True) > 0.5)  # a face across the seam
     uv = np.stack([around, corners[..., 2] / size[2] + 0.5], axis=-1)
-    flat = (part.name == "box") | (np.abs(normal[:, 2]) > 0.999 * np.linalg.norm(normal, axis=1))
+    flat = by_side | (part.name == "box") | (np.abs(normal[:, 2]) > 0.999 * np.linalg.norm(normal, axis=1))
     uv[flat] = (np.einsum("fkc,afc->fka", corners / size, np.stack([right, up])) + 0.5)[flat]
     faces = np.arange(corners.size // 3, dtype=np.int32).reshape(-1, 3)
-    vertices = frozen_array(corners.reshape(-1, 3))
-    return replace(part, vertices=vertices, faces=frozen_array(faces, np.int32), uv=frozen_array(uv.reshape(-1, 2)))
+    each = part.faces.ravel()
+    return replace(
+        part,
+        vertices=frozen_array(part.vertices[each]),
+        faces=frozen_array(faces, np.int32),
+        normals=None if part.normals is None else frozen_array(part.normals[each]),
+        uv=frozen_array(uv.reshape(-1, 2)),
+        colors=None if part.colors is None else frozen_array(part.colors[each], np.uint8),
+    )
 
 
 def read_geometry(
@@ -210,7 +225,7 @@ def turned(path: Path, xyz: str, rpy: str, unit: float = 1.0) -> Pose:
 def numbers(path: Path, text: str | None, count: int, positive: bool = False) -> Array:
     """[count] finite float64; MeshError `unreadable`."""
     try:
-        values = np.array([float(word) for word in (text or "").split()])
+        values = np.array([float(word.removesuffix(",")) for word in (text or "").split()])  # as robots' parsers do
     except ValueError:
         values = np.array([])
     if len(values) != count or not np.isfinite(values).all() or (positive and (values <= 0).any()):

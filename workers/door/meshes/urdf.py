@@ -72,7 +72,8 @@ def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
         body = wrap_body(visual.body) if visual.body is not None and visual.texture is not None else visual.body
         loaded = load(visual.mesh or "") if body is None else LoadedMesh(Shape((body,)), ())
         source.notes += [note for note in loaded.notes if not (visual.dresses and note.endswith(UNPAINTED))]
-        for part in transform_shape(loaded.shape, visual.T).parts:
+        shape = Shape(tuple(wrap_body(part, True) for part in loaded.shape.parts)) if visual.by_side else loaded.shape
+        for part in transform_shape(shape, visual.T).parts:
             check_coordinates(path, part.vertices)
             dressed = with_jpeg(_dressed(part, visual, source), source)
             parts.append(replace(dressed, name=f"part{len(parts)}"))
