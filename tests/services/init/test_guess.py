@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import trimesh
 
 from schemas.job.assets import is_usable
@@ -10,7 +11,7 @@ from schemas.scene.shape import Material, Part, Shape
 from workers.assets.library.collection import SUFFIXES
 from workers.assets.library.copies import Item, find_copies, find_doubles
 from workers.assets.library.guess import find_joined, guess_groups, guess_ups, name_categories
-from workers.assets.library.placement import Measured, sample_look
+from workers.assets.library.placement import Measured, measure_handed, sample_look
 from workers.door.meshes.raw import DEFAULT
 
 CATEGORIES = (
@@ -254,6 +255,29 @@ def test_looks_differ_by_the_colours_where_faces_lie_and_not_by_how_the_thing_is
     assert like(*patterned[:2]) and not like(*patterned[1:])
 
 
+def test_a_mirror_image_has_the_other_sign_however_it_is_turned_and_what_is_its_own_has_none():
+    def handed(mesh):
+        return measure_handed(*(mesh.triangles[:, k] for k in range(3)))
+
+    def with_arms(*arms):
+        boxes = [trimesh.creation.box(bounds=bounds) for bounds in arms]
+        return trimesh.util.concatenate([box.subdivide().subdivide() for box in boxes])
+
+    left = with_arms([[0, 0, 0], [3, 1, 1]], [[0, 1, 0], [1, 2.5, 1]], [[2, 0, 1], [3, 1, 1.7]])
+    rotations = [
+        np.eye(4),
+        *(trimesh.transformations.random_rotation_matrix(x) for x in np.random.default_rng(0).random((8, 3))),
+    ]
+    for T in rotations:
+        assert (
+            handed(left.copy().apply_transform(T)) == pytest.approx(handed(left), rel=1e-6) and abs(handed(left)) > 0.01
+        )
+        assert handed(left.copy().apply_transform(T @ np.diag([1, -1, 1, 1]))) == pytest.approx(-handed(left), rel=1e-6)
+        assert abs(handed(with_arms([[0, 0, -1], [3, 1, 1]], [[2, 1, -1], [3, 3, 1]]).apply_transform(T))) < 1e-6
+    flat = np.random.default_rng(1).normal(size=(3, 9, 3)) * (1.0, 1.0, 0.0)
+    assert measure_handed(*flat) == measure_handed(*0 * flat) == 0.0
+
+
 def patterned_box(seed):
     """A cube with one picture on each side: as many black as white squares, in an order of its own."""
     squares = np.random.default_rng(seed).permutation(np.repeat(np.array([0, 255], np.uint8), 18)).reshape(6, 6)
@@ -281,6 +305,9 @@ def test_one_object_twice_is_offered_once_and_like_shapes_are_not_one():
         (solid("x/a.urdf", faces=12), solid("x/visual/b.obj", faces=12)),
         (solid("a.obj", look=RED, textures=1), solid("b/a.obj", look=RED_TURNED, textures=1)),
         (solid("a.obj", look=RED, textures=1), solid("b/a.obj", look=BLUE)),
+        (solid("a/glove.obj", handed=0.1), solid("b/glove.obj", handed=0.1)),
+        (solid("a/glove.obj", handed=0.0004), solid("b/glove.obj", handed=-0.0004)),  # what rounding leaves of 0
+        (solid("a/glove.glb", handed=0.1), solid("a/glove.obj", handed=-0.1)),  # some programs write x to the left
     )
     for first, second in doubles:
         for pair in ((first, second), (second, first)):
@@ -294,6 +321,8 @@ def test_one_object_twice_is_offered_once_and_like_shapes_are_not_one():
         (solid("a.obj"), solid("b.obj", volume=0.31)),
         (solid("a.obj"), solid("b.obj", faces=201)),
         (solid("a/box.obj", faces=12), solid("b/box.obj", faces=12)),
+        (solid("left/glove.obj", handed=0.1), solid("right/glove.obj", handed=-0.1)),
+        (solid("left.glb", handed=-0.033), solid("right.obj", handed=0.033)),
         (solid("a.obj", look=RED, textures=1), solid("b.obj", look=BLUE, textures=1)),
     ):
         assert find_doubles([first, second], lambda item: item.diagonal, SUFFIXES) == []

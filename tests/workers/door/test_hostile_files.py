@@ -181,7 +181,7 @@ HOSTILE = {
     "view.gltf": (view(byteLength=10**9), "unreadable", "beyond its buffer"),
     "before.gltf": (view(byteOffset=-8), "unreadable", "beyond its buffer"),
     "wrong.gltf": (view(buffer=7), "unreadable", "IndexError"),
-    "version.gltf": ({"asset": {"version": "1.0"}}, "unreadable", "only 2.x"),
+    "version.gltf": ({"asset": {"version": "1.0"}}, "format", "only 2.x is read: export it as glTF 2.0"),
     "no_asset.gltf": ({"asset": None}, "unreadable", "no `asset`"),
     "draco.gltf": ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "format", "export it without"),
     "promises.gltf": (

@@ -625,6 +625,10 @@ ROWS: dict[str, tuple[dict[str, bytes], Right | str]] = {
     "dae in another file": (dae(node='<instance_geometry url="b.dae#g"/>'), "b.dae#g"),
     # STL and OFF
     "off": (off(), Right((GREY,))),
+    "off with faces over lines": (
+        {"a.off": re.sub(rb"(?m)^4 (\d+) (\d+) ", rb"4 \1 \n\2\n", off()["a.off"])},
+        Right((GREY,)),
+    ),
     "off of trimesh": (
         {"a.off": trimesh.creation.box((0.2, 0.2, 0.2)).export(file_type="off").encode()},
         Right((GREY,)),

@@ -150,6 +150,9 @@ FEW = 50
 SMALL = 0.02
 """Below this, metres or a share of a size, a difference counts as that of something so large."""
 
+HANDED = 0.002
+"""`Measured.handed` of both, together and of opposite signs, from which on they are a left one and a right one."""
+
 ALIKE_COLOUR = 2.0
 """Mean difference of colours by place, of 255, up to which two meshes may be one: a picture in half its size, compressed
 again as JPEG, differs by about 1."""
@@ -167,9 +170,9 @@ def find_doubles(items: Sequence[Item], size_m: Callable[[Item], float], formats
     """The items that are another one again: the same shape and size in metres, or in one folder the same shape.
 
     Two shapes are the same that have as many faces, and extents, area and volume alike in whatever order of axes; unless
-    both have pictures, or neither has, and their colours differ where faces lie. One name in two formats needs no more than
-    extents and area alike: readers drop faces, and some programs write other colours as linear light. That stays which has
-    pictures, then colours, then the format that comes first in `formats`.
+    they are mirror images, or both have pictures, or neither has, and their colours differ where faces lie. One name in two
+    formats needs no more than extents and area alike: readers drop faces, and some programs write other colours as linear
+    light. That stays which has pictures, then colours, then the format that comes first in `formats`.
     """
     order = sorted(
         items,
@@ -202,6 +205,8 @@ def _is_double(item: Item, other: Item, size_m: Callable[[Item], float]) -> bool
         ours, others = ours[:-1], others[:-1]
     pairs = zip(ours if near else (*ours, size_m(item)), others if near else (*others, size_m(other)), strict=True)
     if not all(abs(a - b) <= ALIKE * max(abs(a), abs(b), SMALL) for a, b in pairs):
+        return False
+    if not same and abs(mine.handed + theirs.handed) < 0.1 * abs(mine.handed - theirs.handed) > HANDED:
         return False
     if same or mine.look is None or theirs.look is None or bool(mine.textures) != bool(theirs.textures):
         return True

@@ -58,6 +58,9 @@ def read_off(path: Path, data: bytes, resolver: FolderResolver) -> list[RawMesh]
     vertices, faces = int(lines[0][0]), int(lines[0][1])
     rows = np.array(lines[1 : 1 + vertices], dtype=np.float64).reshape(vertices, -1)
     listed = lines[1 + vertices : 1 + vertices + faces]
+    if any(len(line) <= int(line[0]) for line in listed):  # faces over several lines, which then have no colours
+        words = iter([word for line in lines[1 + vertices :] for word in line])
+        listed = [[count, *islice(words, int(count))] for count in islice(words, faces)]
     counts = np.array([int(line[0]) for line in listed])
     corners = np.array([word for line in listed for word in line[1 : 1 + int(line[0])]], dtype=np.int64)
     if len(listed) < faces or len(corners) != counts.sum():

@@ -79,7 +79,8 @@ def _parse(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
     if not isinstance(tree, dict) or not isinstance(tree.get("asset"), dict):
         raise ValueError("no glTF: it has no `asset`")
     if not str(tree["asset"].get("version", "")).startswith("2"):
-        raise ValueError(f"glTF version {tree['asset'].get('version')!r:.20}: only 2.x is read")
+        stated = f"{tree['asset'].get('version')!r:.20}"
+        raise MeshError("format", f"{path} is glTF of version {stated}, and only 2.x is read: export it as glTF 2.0")
     return tree, binary
 
 
