@@ -361,11 +361,13 @@ def _against_truth(result: "CaptureViews") -> tuple["SurfaceErrors", dict[str, A
 
 
 def _against_mesh(result: "CaptureViews", options: argparse.Namespace) -> tuple["SurfaceErrors", dict[str, Any]]:
-    from workers.capture.score import read_mesh_file, score_against_mesh
+    from workers.capture.score import describe_misfit, read_mesh_file, score_against_mesh
 
     surface, T_board_obj, rms_mm = score_against_mesh(result, read_mesh_file(options.mesh))
     print(f"{options.mesh} was aligned to the cloud by ICP, which leaves {rms_mm:.2f} mm rms:")
     print("poses are not scored, and errors that a rigid motion explains are not seen")
+    if note := describe_misfit(result.surface.points, rms_mm):
+        print(f"note: {note}")
     answer = {"aligned_by": "icp", "icp_rms_mm": rms_mm, "T_board_obj": T_board_obj.tolist()}
     return surface, {**dict.fromkeys(("pose_mm", "pose_deg", "depth_median_mm")), **answer}
 

@@ -116,7 +116,7 @@ CAPTURE_COMMANDS: Final[dict[str, Command]] = {
     "evaluate": command(
         "score a processed capture against its truth or a given mesh",
         "data/mug --json",
-        *(FOLDER, path("--mesh", "FILE", "the object's mesh, metres, in its own frame")),
+        *(FOLDER, path("--mesh", "FILE", "the object's mesh, metres, any axis up")),
         handler="capture:evaluate",
     ),
 }

@@ -1,20 +1,20 @@
 """A processed capture against truth: that of its simulation, or a mesh that the user gives, which is aligned to it first."""
 
-import io
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
 from schemas.capture import CaptureScore, Reconstruction, SynthesizedView, ViewScore
-from schemas.errors import CaptureError, ViewError
+from schemas.errors import CaptureError, MeshError, ViewError
+from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
 from workers.capture.folder import CaptureFolder
@@ -22,6 +22,7 @@ from workers.capture.process import CaptureViews
 from workers.capture.surface.coverage import describe_grazing, sample_surface
 from workers.capture.surface.posed_view import UNSEEN, PosedView, best_cosine, facing_cosine, placed
 from workers.capture.truth import MESH_FILE, TRUTH, read_truth
+from workers.door.meshes.formats import FORMATS, load_shape
 from workers.geometry.camera import project, spread_evenly
 from workers.geometry.distance import distance_to_mesh
 from workers.geometry.frames import UP, angle_between, invert, pose, rotation_about, transform
@@ -107,8 +108,13 @@ def compare_view(view: SynthesizedView, depth_m: Array, rgb: NDArray[np.uint8]) 
 
 
 TURNS = 24
-"""Starts: the mesh stands as it is, z up, turned about the vertical by so many angles."""
+"""Starts: the mesh stands on each of its sides, turned about the vertical by so many angles."""
 
+UPS = [np.eye(3), *(rotation_about(axis, angle) for axis, angle in product(np.eye(3)[:2], (0.5 * np.pi, -0.5 * np.pi)))]
+UPS += [rotation_about(np.eye(3)[0], np.pi)]
+"""What takes each of a mesh's axes up, and down; those after the first are tried where it does not fit."""
+GOOD, LOOSE = 0.01, 0.02
+"""Trimmed distances, of the cloud's size, below which a mesh fits, and from which on it may be another one."""
 STEPS_TRY, STEPS_FINE = 12, 60
 FEW, MANY = 1500, 8000
 TRIM = 0.9
@@ -116,19 +122,23 @@ TRIM = 0.9
 
 
 def align_mesh(points: Array, mesh: Mesh) -> tuple[Pose, float]:
-    """(T_board_obj [4, 4], millimetres) of the mesh, z up, metres, that fits points [N, 3] best.
+    """(T_board_obj [4, 4], millimetres) of the mesh, metres, any of its axes up, that fits points [N, 3] best.
 
-    The millimetres are the root mean square distance of the points to it, trimmed. Raises CaptureError for fewer than 100 points.
+    The millimetres are the root mean square distance of the points to it, trimmed. Raises CaptureError for fewer than 100
+    points, and for a mesh of quite another size.
     """
     if len(points) < 100:
         raise CaptureError("no_surface", f"a cloud of {len(points)} points cannot be aligned")
+    _check_size(points, mesh)
     samples, normals = sample_surface(mesh, MANY)
     tree = cKDTree(samples)
     few, many = (points[:: max(1, len(points) // count)] for count in (FEW, MANY))
     goal = 0.5 * (points.min(axis=0) + points.max(axis=0))
-    tries = []
-    for turn in range(TURNS):
-        R = rotation_about(UP, 2.0 * np.pi * turn / TURNS)
+    tries, fits = list[tuple[float, Pose]](), GOOD * np.linalg.norm(np.ptp(points, axis=0))
+    for up, turn in product(UPS, range(TURNS)):
+        if turn == 0 and any(error < fits**2 for error, _ in tries):
+            break
+        R = rotation_about(UP, 2.0 * np.pi * turn / TURNS) @ up
         turned = mesh.vertices @ R.T
         shift = goal - 0.5 * (turned.min(axis=0) + turned.max(axis=0))
         shift[2] = points[:, 2].max() - turned[:, 2].max()  # tops together: the foot is not seen
@@ -137,6 +147,25 @@ def align_mesh(points: Array, mesh: Mesh) -> tuple[Pose, float]:
     _, T = _iterate(many, samples, normals, tree, start, STEPS_FINE)
     distance = np.sort(distance_to_mesh(transform(invert(T), many), mesh)[0])[: int(TRIM * len(many))]
     return T, 1e3 * float(np.sqrt((distance**2).mean()))
+
+
+def _check_size(points: Array, mesh: Mesh) -> None:
+    """Raises CaptureError for a mesh too small to have these points, or so large that they are nearly nothing of it."""
+    size, cloud = (float(np.linalg.norm(np.ptp(each, axis=0))) for each in (mesh.vertices, points))
+    if not 0.5 * cloud < size < 4.0 * cloud:
+        scale = next((k for k in (0.001, 0.01, 0.0254, 1000.0, 100.0) if 0.8 * cloud < k * size < 2.0 * cloud), None)
+        remedy = "is it this object?" if scale is None else f"scale it by {scale:g} if it is this object"
+        raise CaptureError(
+            "size",
+            f"the mesh is {size:.3g} m across, and what was captured {cloud:.3g} m; it is read in metres: {remedy}",
+        )
+
+
+def describe_misfit(points: Array, rms_mm: float) -> str | None:
+    """A sentence where points [N, 3] lie so far off an aligned mesh that it may be another one."""
+    size_mm = 1e3 * float(np.linalg.norm(np.ptp(points, axis=0)))
+    share = f"{rms_mm:.1f} mm are {rms_mm / size_mm:.0%} of what was captured"
+    return f"{share}: is it this object, whole?" if rms_mm > max(LOOSE * size_mm, 1e3 * COMPLETE_M) else None
 
 
 def _iterate(points: Array, samples: Array, normals: Array, tree: cKDTree, T: Pose, steps: int) -> tuple[float, Pose]:
@@ -179,16 +208,13 @@ class Score:
 
 def read_mesh_file(path: Path) -> Mesh:
     """The triangles of a mesh file. Raises CaptureError where it cannot be read or has none."""
-    if not path.exists():
-        raise CaptureError("missing", f"{path} is not there")
+    if path.suffix.lower() not in FORMATS:
+        raise CaptureError("format", f"{path} is none of {', '.join(FORMATS)}: export it as one of those")
     try:
-        stream = io.BytesIO(path.read_bytes())
-        mesh = trimesh.load_scene(stream, file_type=path.suffix[1:].lower(), process=False).to_mesh()
-    except Exception as error:  # readers of many formats raise errors of many kinds
-        raise CaptureError("unreadable", f"{path} is no mesh that can be read: {error!r}") from error
-    if not len(mesh.faces):
-        raise CaptureError("unreadable", f"{path} has no triangles")
-    return Mesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int32))
+        shape = load_shape(path, MeshLimits()).shape
+    except MeshError as error:
+        raise CaptureError(error.reason, error.detail) from error
+    return Mesh(shape.vertices, shape.faces)
 
 
 def read_whole_truth(folder: CaptureFolder) -> Truth | None:

@@ -42,6 +42,7 @@ from workers.capture.reconstruct import (
 )
 from workers.capture.results import read_surface, write_results
 from workers.capture.score import (
+    describe_misfit,
     read_mesh_file,
     read_whole_truth,
     score_against_mesh,
@@ -588,12 +589,28 @@ def test_the_score_of_a_good_capture_is_good_and_poses_that_are_off_are_told_by_
 def test_a_mesh_from_elsewhere_is_aligned_and_scored_as_in_place_and_a_file_that_is_none_refused(result, tmp_path):
     true = read_whole_truth(result.folder).surface
     away = pose(rotation_about(np.array([0.0, 0.0, 1.0]), 2.0), np.array([3.0, -1.0, 0.5]))
-    found, _, rms_mm = score_against_mesh(result, Mesh(transform(away, true.vertices), true.faces))
-    assert rms_mm < 1.0
-    assert found.cloud_median_mm < 1.0 and found.cloud_p95_mm < 3.0 and found.completeness > 0.9
+    lying = pose(rotation_about(np.array([1.0, 0.0, 0.0]), -0.5 * np.pi), np.zeros(3))  # y up, as glTF has it
+    for T in (away, away @ lying):
+        found, _, rms_mm = score_against_mesh(result, Mesh(transform(T, true.vertices), true.faces))
+        assert rms_mm < 1.0 and describe_misfit(result.surface.points, rms_mm) is None
+        assert found.cloud_median_mm < 1.0 and found.cloud_p95_mm < 3.0 and found.completeness > 0.9
+    for scale, told in (
+        (1000.0, "metres: scale it by 0.001 if"),
+        (0.01, "scale it by 100 if"),
+        (7.0, "is it this object"),
+    ):
+        with pytest.raises(CaptureError, match=told):
+            score_against_mesh(result, Mesh(scale * true.vertices, true.faces))
+    other = trimesh.creation.uv_sphere(0.5 * np.ptp(true.vertices, axis=0).max())
+    rms_mm = score_against_mesh(result, Mesh(other.vertices, other.faces.astype(np.int32)))[2]
+    assert "is it this object, whole?" in describe_misfit(result.surface.points, rms_mm)
     assert read_whole_truth(dataclasses.replace(open_folder(box()), path=tmp_path)) is None
     (tmp_path / "bad.ply").write_bytes(b"nonsense")
-    for name, words in (("none.ply", "is not there"), ("bad.ply", "no mesh that can be read")):
+    for name, words in (
+        ("none.ply", "missing: .* check its name"),
+        ("bad.ply", "bad.ply is not a"),
+        ("a.fbx", "none of .glb"),
+    ):
         with pytest.raises(CaptureError, match=words):
             read_mesh_file(tmp_path / name)
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "box.stl")
