@@ -4,7 +4,7 @@ import io
 import json
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -337,12 +337,24 @@ def write_synthesized(result: CaptureViews, T_board_cam: Pose, out: Path) -> dic
     return _write_views(result, out, [(0, camera, result.synthesize(camera), {})])[0]
 
 
+@contextmanager
+def unless_unseen() -> Iterator[None]:
+    """Passes over a view that sees nothing of the object or has no depth; what is damaged is told."""
+    try:
+        yield
+    except ViewError:
+        return
+    except CaptureError as error:
+        if error.reason not in ("nothing_seen", "no_depth"):
+            raise
+
+
 def write_mirrors(result: CaptureViews, out: Path) -> list[dict[str, Any]]:
     """The mirror view of every used view, with the number of that view; views that see nothing of the object have none."""
 
     def mirrors() -> Iterator[Written]:
         for view in result.estimate.used:
-            with suppress(ViewError, CaptureError):
+            with unless_unseen():
                 camera, d_z, shown = result.mirror(view.number)
                 yield view.number, camera, shown, {"d_z_m": d_z}
 

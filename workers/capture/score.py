@@ -1,7 +1,6 @@
 """A processed capture against truth: that of its simulation, or a mesh that the user gives, which is aligned to it first."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -13,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from schemas.base import Array, Pose
 from schemas.capture import CaptureScore, Reconstruction, SynthesizedView, ViewScore
-from schemas.errors import CaptureError, MeshError, ViewError
+from schemas.errors import CaptureError, MeshError
 from schemas.job.assets import MeshLimits
 from schemas.scene.shape import Mesh
 from schemas.scene.view import Camera
 from workers.capture.folder import CaptureFolder
-from workers.capture.process import CaptureViews
+from workers.capture.process import CaptureViews, unless_unseen
 from workers.capture.surface.coverage import describe_grazing, sample_surface
 from workers.capture.surface.posed_view import UNSEEN, PosedView, best_cosine, facing_cosine, placed
 from workers.capture.truth import MESH_FILE, TRUTH, read_truth
@@ -296,7 +295,7 @@ def score_held_out(views: CaptureViews, truth: Truth, known: Sequence[int], most
     for number in (known[place] for place in spread_evenly(len(known), most)):
         camera = Camera(views.folder.camera.intrinsics, truth.T_board_cam[number])
         depth_m = cast_view([placed(truth.surface)], camera)[0]  # of the object alone
-        with suppress(CaptureError, ViewError):  # the view sees nothing of the object, or nothing beside it does
+        with unless_unseen():
             made = views.synthesize(camera, without=number)
             errors[number] = compare_view(made, depth_m, views.posed(number).rgb)
     return errors

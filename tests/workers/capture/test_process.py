@@ -560,6 +560,15 @@ def test_synthesised_views_are_written_with_pose_and_shares_and_never_into_the_c
     assert all(0.3 < one["d_z_m"] < 1.2 for one in mirrors) and len(list(tmp_path.glob("mirrors/rgb_*.png"))) == VIEWS
     with pytest.raises(OutputError, match="name another folder"):
         write_synthesized(result, T, result.folder.path)
+    shutil.copytree(result.folder.path, tmp_path / "torn")
+    depth = tmp_path / "torn/depth_00002.png"
+    depth.write_bytes(depth.read_bytes()[:100])
+    for read in (
+        lambda torn: write_mirrors(torn, tmp_path / "no"),
+        lambda torn: score_capture(torn, read_whole_truth(torn.folder)),
+    ):
+        with pytest.raises(CaptureError, match=r"depth_00002\.png is no image that can be read"):
+            read(read_result(tmp_path / "torn"))
 
 
 # ---------------------------------------------------------------------------------------------- scores

@@ -239,6 +239,12 @@ def test_what_is_called_measured_lies_on_the_object_or_the_board_whatever_single
     assert (view.measured & view.mask).sum() > 0.8 * view.mask.sum()
 
 
+def test_a_camera_that_sees_the_board_alone_has_no_mask_and_no_warning():
+    beside = frozen_array(look_at(np.array([0.3, 0.2, 0.5]), np.array([0.3, 0.21, 0.0])))
+    view = synthesize_view(sources(0.0), Camera(K.model_copy(update={"fx": 2000.0, "fy": 2000.0}), beside), body())
+    assert not view.mask.any() and (view.depth_m > 0.0).any()
+
+
 @pytest.mark.minute
 def test_what_no_view_sees_of_the_object_is_its_own_and_counts_as_not_measured():
     camera, place = camera_at(0.3, 0.1, 0.7), (0.03, 0.0)

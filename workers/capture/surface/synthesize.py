@@ -275,7 +275,7 @@ def _between(depth_m: Array, body_m: Array) -> NDArray[np.bool_]:
 def _unseen_holes(body: NDArray[np.bool_], known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """[H, W] bool: holes in the body through which less than half is known: they are the object's, as what no view saw."""
     label, count = ndimage.label(~body)
-    few = ndimage.mean(known, label, np.arange(count + 1)) < 0.5
+    few = np.append(False, ndimage.mean(known, label, np.arange(1, count + 1)) < 0.5)
     few[[0, *label[[0, -1]].ravel(), *label[:, [0, -1]].ravel()]] = False
     return np.asarray(few[label])
 
