@@ -1,5 +1,6 @@
 """MJCF and SDF beside URDF: what is seen of them, where it lies and how it looks; MuJoCo itself is the judge of MJCF."""
 
+import re
 import struct
 
 import mujoco
@@ -319,6 +320,39 @@ def test_an_mjcf_is_read_with_what_it_includes_as_mujoco_has_it(tmp_path):
     files = {file.name for file in list_files(tmp_path, path, LIMITS)}
     assert files == {"a.xml", "assets.xml", "bodies.xml", "tip.xml", "cube.obj"}
     assert files - {"a.xml"} == {file.name for file in list_named(path, tmp_path, LIMITS)}, "parts, and no objects"
+
+
+STANDING = """<visual><origin xyz="0 0 0.5"/><geometry><mesh filename="stick.glb" scale=".5"/></geometry></visual>
+<visual><geometry><sphere radius="0"/></geometry></visual><collision><origin xyz="0 0 0.5"/><geometry>{}</geometry></collision>"""
+
+
+def test_a_gltf_in_a_urdf_or_sdf_is_turned_as_its_collision_shapes_say_or_else_as_its_programs_do(tmp_path):
+    trimesh.creation.box(bounds=[[0, 0, 0], [0.1, 1.0, 0.2]]).export(tmp_path / "stick.glb")  # y up
+    trimesh.creation.box(bounds=[[0, -0.2, 0], [0.1, 0, 1.0]]).export(tmp_path / "upright.stl")
+    lying, standing = [[0, 0, 0.5], [0.05, 0.5, 0.6]], [[0, -0.1, 0.5], [0.05, 0, 1.0]]
+    sdf = "<sdf><model><link>{}</link></model></sdf>"
+    for name, collides, expected in (
+        ("a.urdf", '<mesh filename="upright.stl" scale=".5 .5 .5"/>', standing),
+        ("b.urdf", '<box size="0.05 1 0.2"/>', lying),
+        ("c.urdf", '<mesh filename="stick.glb" scale="0.5"/>', standing),
+        ("d.urdf", '<mesh filename="lost.stl"/>', standing),
+        ("e.urdf", '<box size="nothing"/>', standing),
+        ("f.sdf", '<mesh filename="stick.glb"/>', lying),
+        ("h.sdf", '<mesh filename="package://all/stick.glb"/>', standing),
+        ("g.sdf", '<mesh filename="upright.stl" scale=".5 .5 .5"/>', standing),
+    ):
+        links = STANDING.format(collides)
+        if name.endswith("sdf"):
+            links = re.sub(r'<origin xyz="([^"]*)"/>', r"<pose>\1 0 0 0</pose>", links)
+            links = re.sub(
+                r'<mesh filename="([^"]*)"(?: scale="[^"]*")?/>', r"<mesh><uri>\1</uri><scale>.5</scale></mesh>", links
+            )
+            links = links.replace('<sphere radius="0"/>', "<sphere><radius>0</radius></sphere>")
+        path = write(tmp_path / name, urdf(links) if name.endswith("urdf") else sdf.format(links))
+        (box,) = boxes(load_posed(path, LIMITS, tmp_path).shape)
+        assert box == pytest.approx(np.array(expected), abs=1e-6), name
+    read = {file.name for file in list_files(tmp_path, tmp_path / "a.urdf", LIMITS)}
+    assert read == {"a.urdf", "stick.glb", "upright.stl"}, "what decides is part of what was read"
 
 
 @pytest.mark.parametrize("joint", ["<freejoint/>", '<joint type="free"/>'])

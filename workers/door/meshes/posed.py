@@ -50,10 +50,15 @@ class Visual:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What a file poses: what is seen of it, and the names of all its meshes, also of those that only collide."""
+    """What a file poses: what is seen of it, the names of all its meshes, and what collides, where that is known.
+
+    turns: whether its programs turn a glTF's y up to z: RViz (since 2025) and Drake do, Gazebo and MuJoCo do not.
+    """
 
     visuals: tuple[Visual, ...]
     meshes: tuple[str, ...]
+    collisions: tuple[Visual, ...] = ()
+    turns: bool = False
 
 
 class Source(FolderResolver):
@@ -183,18 +188,23 @@ def wrap_body(part: Part, by_side: bool = False) -> Part:
 def read_geometry(
     path: Path, visual: ElementTree.Element, T: Pose, stated: Callable[..., str | None], file: str
 ) -> Visual | None:
-    """What a visual of a URDF or SDF shows, its own frame at T; None for what has no end, or is nothing. MeshError `unreadable`.
+    """What a visual of a URDF or SDF shows, its own frame at T; None for what has no end, no size, or is nothing.
+
+    Raises MeshError `unreadable`.
 
     stated: how an element states a value by its name; file: the name of a mesh's file.
     """
     for kind in visual.iterfind("geometry/*"):
         value_of = partial(stated, kind)
         if kind.tag == "mesh":
-            scale = scaled(path, numbers(path, value_of("scale", "1 1 1"), 3))
+            words = (value_of("scale") or "1").split()
+            scale = scaled(path, numbers(path, " ".join(words * 3 if len(words) == 1 else words), 3))
             return Visual(T @ scale, (value_of(file) or "").strip())
         if kind.tag in ("plane", "empty"):
             return None
         sizes = [numbers(path, value_of(name), count, positive=True) for name, count in _SIZES.get(kind.tag, ())]
+        if any((size == 0.0).any() for size in sizes):
+            return None
         return Visual(T, body=make_body(path, kind.tag, np.concatenate(sizes or [np.zeros(0)])))
     return None
 
@@ -223,11 +233,11 @@ def turned(path: Path, xyz: str, rpy: str, unit: float = 1.0) -> Pose:
 
 
 def numbers(path: Path, text: str | None, count: int, positive: bool = False) -> Array:
-    """[count] finite float64; MeshError `unreadable`."""
+    """[count] finite float64, if `positive` none below 0; MeshError `unreadable`."""
     try:
         values = np.array([float(word.removesuffix(",")) for word in (text or "").split()])  # as robots' parsers do
     except ValueError:
         values = np.array([])
-    if len(values) != count or not np.isfinite(values).all() or (positive and (values <= 0).any()):
+    if len(values) != count or not np.isfinite(values).all() or (positive and (values < 0).any()):
         raise MeshError("unreadable", f"{path}: {text!r:.60} is not {count} {'positive ' if positive else ''}numbers")
     return values

@@ -1,7 +1,8 @@
 """Edge: what is seen of a URDF, SDF or MJCF from outside as one shape; and the readers of URDF and SDF."""
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from os.path import relpath
@@ -30,6 +31,7 @@ from workers.door.meshes.posed import (
 )
 from workers.door.meshes.raw import DEFAULT, UNPAINTED, check_counts, check_nodes, find_inside
 from workers.door.opening import as_utf8, read_bytes
+from workers.geometry.frames import pose, rotation_about
 
 
 def read_model(path: Path, root: Path, limits: MeshLimits) -> tuple[Source, Model]:
@@ -50,7 +52,8 @@ def list_seen(path: Path, root: Path, limits: MeshLimits) -> tuple[list[Path], l
     source, model = read_model(path, root, limits)
     names = dict.fromkeys(visual.mesh for visual in model.visuals if visual.mesh is not None)
     pictures = dict.fromkeys(visual.texture for visual in model.visuals if visual.texture is not None)
-    return list(dict.fromkeys(map(source.demand, names))), [*source.files, *source.find_all(pictures)]
+    collide = [one.mesh for one in model.collisions if one.mesh] if any(map(_is_gltf, model.visuals)) else []
+    return list(dict.fromkeys(map(source.demand, names))), [*source.files, *source.find_all([*pictures, *collide])]
 
 
 def list_named(path: Path, root: Path, limits: MeshLimits) -> list[Path]:
@@ -68,12 +71,13 @@ def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
     def load(name: str) -> LoadedMesh:
         return load_shape(source.demand(name), limits, root, source.budget)
 
+    turn = _turn_of_gltf(model, load)
     for visual in model.visuals:
         body = wrap_body(visual.body) if visual.body is not None and visual.texture is not None else visual.body
         loaded = load(visual.mesh or "") if body is None else LoadedMesh(Shape((body,)), ())
         source.notes += [note for note in loaded.notes if not (visual.dresses and note.endswith(UNPAINTED))]
         shape = Shape(tuple(wrap_body(part, True) for part in loaded.shape.parts)) if visual.by_side else loaded.shape
-        for part in transform_shape(shape, visual.T).parts:
+        for part in transform_shape(shape, visual.T @ turn if _is_gltf(visual) else visual.T).parts:
             check_coordinates(path, part.vertices)
             dressed = with_jpeg(_dressed(part, visual, source), source)
             parts.append(replace(dressed, name=f"part{len(parts)}"))
@@ -81,6 +85,34 @@ def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
         check_nodes(path, len(parts), "parts", limits)
         check_counts(path, vertices, faces, limits)
     return LoadedMesh(Shape(tuple(parts)), tuple(dict.fromkeys(source.notes)))
+
+
+def _is_gltf(visual: Visual) -> bool:
+    return visual.mesh is not None and visual.mesh.lower().endswith((".glb", ".gltf"))
+
+
+def _turn_of_gltf(model: Model, load: Callable[[str], LoadedMesh]) -> Pose:
+    """[4, 4]: what takes a glTF's axes to those of what poses it: y up to z, or as they are.
+
+    Programs differ, so that is taken which brings what is seen nearer to what collides, by their boxes; where nothing else than
+    glTF collides, what `Model.turns` says.
+    """
+    turns = [np.eye(4), pose(rotation_about(np.array([1.0, 0.0, 0.0]), 0.5 * np.pi), np.zeros(3))]
+    turns = turns[::-1] if model.turns else turns
+
+    def box(visuals: Sequence[Visual], turn: Pose) -> Array:
+        corners = list[Array]()
+        for visual in visuals:
+            shape = load(visual.mesh or "").shape if visual.body is None else Shape((visual.body,))
+            corners.extend(transform_shape(shape, visual.T @ turn if _is_gltf(visual) else visual.T).bounds)
+        return np.stack([np.min(corners, axis=0), np.max(corners, axis=0)])
+
+    others = [one for one in model.collisions if not _is_gltf(one)]
+    if others and any(map(_is_gltf, model.visuals)):
+        with suppress(MeshError):
+            collides = box(others, np.eye(4))
+            return min(turns, key=lambda turn: float(np.abs(box(model.visuals, turn) - collides).sum()))
+    return turns[0]
 
 
 def _dressed(part: Part, visual: Visual, source: Source) -> Part:
@@ -102,8 +134,13 @@ def read_urdf(source: Source) -> Model:
     """The visuals of all links of a URDF, joints at zero; the frame of the first root link."""
     path, robot = source.path, source.parse(source.path, ["robot"], "a URDF")
     looks = {m.get("name", ""): _look(path, m) for m in robot.iterfind("material")}
-    visuals = []
+    visuals, collisions = list[Visual](), list[Visual]()
     for link, T_root_link in _link_poses(path, robot):
+        for collision in link.iterfind("collision"):
+            with suppress(MeshError):
+                T = T_root_link @ _origin(path, collision)
+                collides = read_geometry(path, collision, T, ElementTree.Element.get, "filename")
+                collisions += [] if collides is None else [collides]
         for visual in link.iterfind("visual"):
             material = visual.find("material")
             look = (None, None) if material is None else _look(path, material)
@@ -112,11 +149,12 @@ def read_urdf(source: Source) -> Model:
             shown = read_geometry(
                 path, visual, T_root_link @ _origin(path, visual), ElementTree.Element.get, "filename"
             )
-            if shown is None:
-                raise MeshError("unreadable", f"{path} has a visual without geometry, or with one that has no end")
-            visuals.append(replace(shown, colour=look[0], texture=look[1]))
+            if visual.find("geometry/*") is None:
+                raise MeshError("unreadable", f"{path} has a visual without geometry")
+            if shown is not None:
+                visuals.append(replace(shown, colour=look[0], texture=look[1]))
     names = (mesh.get("filename", "") for mesh in robot.iterfind("link/*/geometry/mesh"))
-    return Model(tuple(visuals), tuple(dict.fromkeys(names)))
+    return Model(tuple(visuals), tuple(dict.fromkeys(names)), tuple(collisions), turns=True)
 
 
 def _look(path: Path, material: ElementTree.Element) -> tuple[Array | None, str | None]:
@@ -168,17 +206,24 @@ def read_sdf(source: Source) -> Model:
             what = "is a world, and no object" if tag == "world" else f"has <{tag}>, which is not read"
             raise MeshError("format", f"{path} {what}: {remedy}")
     visuals = [visual for model in root.iterfind("model") for visual in _of_model(source, model, np.eye(4), 0)]
+    collisions = list[Visual]()
+    with suppress(MeshError):
+        for model in root.iterfind("model"):
+            collisions += _of_model(source, model, np.eye(4), 0, "collision")
     names = dict.fromkeys((mesh.findtext("uri") or "").strip() for mesh in root.iterfind(".//geometry/mesh"))
-    return Model(tuple(visuals), tuple(names))
+    turns = any(name.startswith("package://") for name in names)  # Drake's; Gazebo has model://, and bare names
+    return Model(tuple(visuals), tuple(names), tuple(collisions), turns)
 
 
-def _of_model(source: Source, model: ElementTree.Element, T_above: Pose, depth: int) -> Iterator[Visual]:
+def _of_model(
+    source: Source, model: ElementTree.Element, T_above: Pose, depth: int, kind: str = "visual"
+) -> Iterator[Visual]:
     path = source.path
     if depth > MOST_ABOVE:
         raise MeshError("unreadable", f"{path} has more than {MOST_ABOVE} models inside one another")
     T = T_above @ _sdf_pose(path, model)
     for link in model.iterfind("link"):
-        for visual in link.iterfind("visual"):
+        for visual in link.iterfind(kind):
             T_visual = T @ _sdf_pose(path, link) @ _sdf_pose(path, visual)
             shown = read_geometry(path, visual, T_visual, ElementTree.Element.findtext, "uri")
             script = visual.find("material/script")
@@ -189,7 +234,7 @@ def _of_model(source: Source, model: ElementTree.Element, T_above: Pose, depth: 
                 colour = _colour(path, visual.findtext("material/diffuse"))
                 yield replace(shown, colour=colour, texture=albedo and albedo.strip())
     for inner in model.iterfind("model"):
-        yield from _of_model(source, inner, T, depth + 1)
+        yield from _of_model(source, inner, T, depth + 1, kind)
 
 
 def _colour(path: Path, text: str | None) -> Array | None:
