@@ -90,7 +90,8 @@ class Source(FolderResolver):
     def demand(self, name: str) -> Path:
         """As `find`; MeshError `missing`."""
         if (path := self.find(name)) is None:
-            raise MeshError("missing", f"{self.path} names {name!r:.200}, which is not inside {self.root}")
+            lost = f"{name!r:.200}, which is not inside {self.root}: name a folder that holds both"
+            raise MeshError("missing", f"{self.path} names {lost}")
         return path
 
     def find_all(self, names: Iterable[str]) -> list[Path]:
