@@ -151,7 +151,7 @@ def align_mesh(points: Array, mesh: Mesh) -> tuple[Pose, float]:
 def _check_size(points: Array, mesh: Mesh) -> None:
     """Raises CaptureError for a mesh too small to have these points, or so large that they are nearly nothing of it."""
     size, cloud = (float(np.linalg.norm(np.ptp(each, axis=0))) for each in (mesh.vertices, points))
-    if not 0.5 * cloud < size < 4.0 * cloud:
+    if not 0.3 * cloud < size < 4.0 * cloud:
         scale = next((k for k in (0.001, 0.01, 0.0254, 1000.0, 100.0) if 0.8 * cloud < k * size < 2.0 * cloud), None)
         remedy = "is it this object?" if scale is None else f"scale it by {scale:g} if it is this object"
         raise CaptureError(

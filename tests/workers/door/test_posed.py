@@ -358,7 +358,7 @@ def test_a_gltf_in_a_urdf_or_sdf_is_turned_as_its_collision_shapes_say_or_else_a
 @pytest.mark.parametrize("joint", ["<freejoint/>", '<joint type="free"/>'])
 def test_of_an_mjcf_s_world_the_one_body_that_moves_freely_is_the_object(tmp_path, joint):
     alone = f"""<body pos="0 0 0.5" euler="0 0 30">{joint}<geom type="box" size="0.1 0.2 0.3"/>
-        <body pos="1 0 0"><joint/><geom type="box" size="0.1 0.1 0.1"/></body></body>"""
+        <frame pos="1 0 0"><body><joint/><geom type="box" size="0.1 0.1 0.1"/></body></frame></body>"""
     table = """<geom type="plane" size="1 1 1"/><geom type="box" size="1 1 0.1"/>
         <body><geom type="box" size="3 3 0.1"/><body><joint/><geom type="box" size="2 2 2"/></body></body>"""
     bare = write(tmp_path / "bare.xml", f"<mujoco><worldbody>{alone}</worldbody></mujoco>")

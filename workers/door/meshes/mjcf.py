@@ -93,7 +93,9 @@ def _include(source: Source, element: Node, depth: int) -> None:
 
 def _leave_out_world(source: Source, root: Node) -> None:
     """Takes out what is around the body that moves freely, which may be in a <frame> and in no other body."""
-    tops = [top for world in root.iterfind("worldbody") for top in (world, *world.iterfind(".//frame"))]
+    tops = list(root.iterfind("worldbody"))
+    for top in tops:
+        tops += top.iterfind("frame")
     bodies = [(top, body) for top in tops for body in top.iterfind("body")]
     free = [
         body for _, body in bodies if body.find("freejoint") is not None or body.find("joint[@type='free']") is not None
