@@ -158,7 +158,11 @@ def test_up_follows_the_files_that_are_sure_and_a_specification_unless_most_of_a
     assert ups(item("mug.glb", up="z")) == {"mug.glb": "z"}, "most of all files are sure"
     for suffix, axis in ((".glb", "y"), (".urdf", "z"), (".xml", "z")):
         fits = guess_ups([item(f"{k}{suffix}", up="x" if k > 2 else None) for k in range(6)])
-        assert fits[f"0{suffix}"][0] == axis and "3 of 6 stand on x alone" in fits[f"0{suffix}"][1], "half are not most"
+        assert fits[f"0{suffix}"][0] == axis and "3 of 6 stand on another axis alone" in fits[f"0{suffix}"][1], (
+            "half are not most"
+        )
+        mixed = guess_ups([item(f"{k}{suffix}", up="xyz"[k % 3]) for k in range(6)])
+        assert "though 4 of 6 stand on another axis alone" in mixed[f"{'xyz'.index(axis)}{suffix}"][1]
         assert fits[f"5{suffix}"][0] == ("y" if suffix == ".glb" else "x"), "but a robot's file may lie on its side"
     stated = [item(f"{k}.dae", stated_up="y") for k in range(3)]
     assert ups(*stated, item("z.dae", stated_up="z"))["z.dae"] == "z", "as each file says"

@@ -532,6 +532,7 @@ ROWS: dict[str, tuple[dict[str, bytes], Right | str]] = {
         ),
         Right(extents=(1.2, 0.2, 0.2), volume=0.048),
     ),
+    "dae of Assimp": (dae(node=f'<node id="<STL_BINARY>" name="<STL_BINARY>">{SHOWN}</node>'), Right()),
     "dae instances of a node": (
         dae(node="<instance_node url='#n'/><node><translate>0.5 0 0</translate><instance_node url='#n'/></node>"),
         Right(extents=(0.7, 0.2, 0.2), volume=0.016),

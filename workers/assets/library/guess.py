@@ -272,7 +272,7 @@ def _decide(items: Sequence[Item], specified: UpAxis | None) -> tuple[UpAxis, st
     if specified is not None:
         against = sum(item.measured.confidence == "sure" and item.measured.up != specified for item in items)
         return specified, "by the format's specification" + (
-            f", though {message.removeprefix('sure: ')}: look at the pictures"
+            f", though {against} of {len(items)} stand on another axis alone: look at the pictures"
             if against
             else "; nothing in the shapes speaks against it"
         )

@@ -21,6 +21,7 @@ from workers.geometry.frames import pose, rotation_about
 
 _DECLARATION, _REMARK = re.compile(rb"<\?xml\s[^>]*\?>"), re.compile(rb"<!--.*?-->", re.DOTALL)
 _NAMESPACE = re.compile(rb"\sxmlns=([\"'])[^\"']*\1")
+_BARE = re.compile(rb"=\"<([^\"<>&]*)>\"")
 _PREFIX = re.compile(rb"(</?|\s)([A-Za-z_][\w.-]*):(?=[A-Za-z_])")
 MAX_XML_BYTES = 10_000_000
 SEGMENTS = 48
@@ -124,6 +125,7 @@ def parse_tree(path: Path, data: bytes, tags: Sequence[str], kind: str) -> Eleme
     declared = _DECLARATION.search(data)
     if declared is not None and not _REMARK.sub(b"", data[: declared.start()]).strip():
         data = data[declared.end() :]
+    data = _BARE.sub(rb'="&lt;\1&gt;"', data)  # Assimp's exporter names nodes so, <STL_BINARY>
     data = _NAMESPACE.sub(b"", data, count=1)
     if b"xmlns:" not in data:
         data = _PREFIX.sub(rb"\1\2_", data)  # robots' own parsers know no namespaces, and let such pass undeclared
