@@ -5,6 +5,7 @@ import unicodedata
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from itertools import zip_longest
+from pathlib import PurePosixPath
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -15,7 +16,7 @@ from schemas.job.views import Render
 from schemas.scene.scene import EffectPlan, Placed
 from schemas.scene.shape import REGION_FIRST_OBJECT, REGION_FLOOR, Asset, Material, Part, Shape
 from schemas.scene.view import Camera, Intrinsics
-from workers.assets.library.guess import ON_TABLE_M, length
+from workers.assets.library.guess import METRIC, ON_TABLE_M, length
 from workers.assets.library.table import Row
 from workers.assets.look.appearance import draw_appearance
 from workers.door.meshes.mesh import transform_shape
@@ -104,11 +105,13 @@ def notes_of(row: Row) -> tuple[str, ...]:
     """What asks for attention."""
     if row.extents_m is None:
         return row.mended
-    size = math.hypot(*row.extents_m)
+    size, mended = math.hypot(*row.extents_m), row.mended
+    if PurePosixPath(row.path).suffix.lower() in METRIC and row.unit in (0.01, 0.001):
+        mended = (f"a unit is taken for {length(row.unit)}, where the format says 1 m: see `unit`", *mended)
     if ON_TABLE_M[0] <= size <= ON_TABLE_M[1]:
-        return row.mended
+        return mended
     how = "small" if size < ON_TABLE_M[0] else "large"
-    return f"{length(size)} across, {how} for a table: see `unit`", *row.mended
+    return f"{length(size)} across, {how} for a table: see `unit`", *mended
 
 
 MOST = 60

@@ -31,6 +31,7 @@ from services.init.shown import (
     draw_object,
     draw_sheet,
     draw_table,
+    notes_of,
 )
 from services.job.job_file import load_job, validate_job
 from tests.services.init.own_meshes import cup, mixed_folder, write_mesh, write_textured
@@ -413,6 +414,18 @@ def test_an_object_of_any_size_fills_its_picture_and_stands_in_it_or_is_seen_to_
         assert abs(np.median(columns) - TILE[0] / 2) < 0.2 * TILE[0]
         assert turned or np.ptp(rows) > 0.5 * TILE[1]
     assert (np.abs(pictures[1.0, False] - pictures[1.0, True]).max(axis=2) > 40).mean() > 0.05
+
+
+def test_a_unit_that_is_not_that_of_the_format_is_noted_where_the_file_is_shown():
+    for path, unit, noted in (
+        ("a/m.sdf", 0.01, True),
+        ("M.GLB", 0.001, True),
+        ("m.glb", 1.0, False),
+        ("m.stl", 0.01, False),
+    ):
+        row = Row(path, unit=unit, extents_m=(0.1, 0.1, 0.1), mended=("so",))
+        told = f"a unit is taken for {'1 cm' if unit == 0.01 else '1 mm'}, where the format says 1 m: see `unit`"
+        assert notes_of(row) == (*[told] * noted, "so")
 
 
 def test_as_many_as_fit_are_drawn_and_the_rest_is_counted(monkeypatch):
