@@ -2,6 +2,7 @@
 and then go on: whatever they do meanwhile, nothing is replaced and a record never wins without its files.
 """
 
+import os
 import random
 import subprocess
 import sys
@@ -25,7 +26,7 @@ from tests.kit.faults import REQUESTS, STILL, disk, requests, taken_over
 from tests.kit.made_up_runs import FIRST, LABEL, RANGE, STOP, broken_promises, coordinator_of, make_dataset, settings_of
 from tests.kit.tiers import first_of
 from tests.made_up_scenes import attempt_at, small_scene, terms
-from workers.store.attempt import Attempt, attempts_at, begin_attempt, sweep
+from workers.store.attempt import Attempt, attempts_at, begin_attempt, sweep, sweep_attempt
 from workers.store.commit import read_record
 from workers.store.ledger import list_commits
 from workers.store.local import LocalStore
@@ -194,6 +195,38 @@ def test_a_worker_that_lives_and_commits_while_it_is_given_up_keeps_its_files(
     for start, end in plan_ranges(0, 2 * trials, 2, list_commits(store).ranges):
         attempt_at(store, start, end, terms(range_size=2), small_scene).commit()
     assert merge(store, 0, 2 * trials).rows["scenes"] > 0
+
+
+def test_a_link_under_way_when_its_attempt_is_given_up_wins_before_the_sweep_looks_or_not_at_all(
+    tmp_path, monkeypatch, unflushed
+):
+    """As the kernel does it: a link's source is found first, and by then its folder may have another name."""
+    store = LocalStore(tmp_path)
+    store.prepare()
+    link, remove_tree, ended = os.link, LocalStore.remove_tree, list[str]()
+
+    def link_late(source, target):
+        with open(source, "rb") as found:
+
+            def go_on(self, prefix):
+                if not ended:  # the sweep has looked for a record, and removes what it takes for a loser's
+                    try:
+                        link(f"/proc/self/fd/{found.fileno()}", target, src_dir_fd=found.fileno())
+                        ended.append("linked")
+                    except FileNotFoundError:
+                        ended.append("refused")
+                remove_tree(self, prefix)
+
+            monkeypatch.setattr(os, "link", link)
+            monkeypatch.setattr(LocalStore, "remove_tree", go_on)
+            sweep_attempt(store, 0, attempt.name, given_up=True)
+        raise FileNotFoundError(source)  # what the worker does now is of no concern
+
+    attempt = attempt_at(store, 0, 2, terms(range_size=2), small_scene)
+    monkeypatch.setattr(os, "link", link_late)
+    with pytest.raises(RunError, match="was swept before it could commit"):
+        attempt.commit()
+    assert ended == ["refused"] and read_record(store, 0) is None
 
 
 @pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["some", "every"])

@@ -13,6 +13,7 @@ from typing import IO
 from schemas.dataset.layout import BEGUN, COMMITS, FENCED, RANGES, STAGING, TEMPORARY, scratch_path
 from schemas.errors import MachineError
 from workers.store.file_system import (
+    HIDDEN,
     OpenTree,
     cannot_be_written,
     explain_disk_errors,
@@ -100,6 +101,10 @@ class LocalStore(Store):
         with contextlib.suppress(FileNotFoundError):
             os.rename(self._own(staging), self.path(staging + FENCED))
             sync_path(self.path(staging).parent)
+        # A link that found its record before the folder had another name still succeeds afterwards, while the record has a name.
+        for name in self.names(staging + FENCED):
+            if name.startswith(HIDDEN):
+                self.remove(f"{staging}{FENCED}/{name}")
         return True
 
     def read(self, key: str) -> bytes:
