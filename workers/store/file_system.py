@@ -206,14 +206,13 @@ def ignore_missing(function: object, path: str, raised: tuple[type[BaseException
         raise raised[1]
 
 
-HIDDEN = "."
-"""With this begin the names of temporary files, and of no others in an attempt's folder."""
-
-
 @contextlib.contextmanager
-def temporary_file(folder: Path, data: bytes, durable: bool) -> Iterator[Path]:
-    """A finished file in `folder`, gone when the context ends. Raises FileNotFoundError where there is no folder."""
-    temporary = folder / f"{HIDDEN}{uuid.uuid4().hex}"
+def temporary_file(folder: Path, data: bytes, durable: bool, name: str | None = None) -> Iterator[Path]:
+    """A finished file in `folder`, gone when the context ends; by default of a name that no other has.
+
+    Raises FileNotFoundError where there is no folder.
+    """
+    temporary = folder / (name or f".{uuid.uuid4().hex}")
     try:
         with open(temporary, "xb") as file:
             file.write(data)

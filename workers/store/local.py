@@ -13,7 +13,6 @@ from typing import IO
 from schemas.dataset.layout import BEGUN, COMMITS, FENCED, RANGES, STAGING, TEMPORARY, scratch_path
 from schemas.errors import MachineError
 from workers.store.file_system import (
-    HIDDEN,
     OpenTree,
     cannot_be_written,
     explain_disk_errors,
@@ -25,6 +24,9 @@ from workers.store.file_system import (
     temporary_file,
 )
 from workers.store.store import Entry, Stage, Store, retry_if_swept
+
+RECORD = ".record"
+"""The name of an attempt's record in its folder, until it is linked."""
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]+://")
 
@@ -102,9 +104,7 @@ class LocalStore(Store):
             os.rename(self._own(staging), self.path(staging + FENCED))
             sync_path(self.path(staging).parent)
         # A link that found its record before the folder had another name still succeeds afterwards, while the record has a name.
-        for name in self.names(staging + FENCED):
-            if name.startswith(HIDDEN):
-                self.remove(f"{staging}{FENCED}/{name}")
+        self.remove(f"{staging}{FENCED}/{RECORD}")
         return True
 
     def read(self, key: str) -> bytes:
@@ -210,7 +210,9 @@ class LocalStore(Store):
         target = self._own(key)
 
         def place_once() -> bool:
-            with temporary_file(self.path(folder), data, durable) as temporary:
+            # Over NFS a list of names may be old: a sweep must know that of an attempt's record.
+            name = None if folder == TEMPORARY else RECORD
+            with temporary_file(self.path(folder), data, durable, name) as temporary:
                 try:
                     name_it(temporary, target)
                 except FileExistsError:
