@@ -134,14 +134,15 @@ def align_mesh(points: Array, mesh: Mesh) -> tuple[Pose, float]:
     few, many = (points[:: max(1, len(points) // count)] for count in (FEW, MANY))
     goal = 0.5 * (points.min(axis=0) + points.max(axis=0))
     tries, fits = list[tuple[float, Pose]](), GOOD * np.linalg.norm(np.ptp(points, axis=0))
-    for up, turn in product(UPS, range(TURNS)):
-        if turn == 0 and any(error < fits**2 for error, _ in tries):
+    for up in UPS:
+        for turn in range(TURNS):
+            R = rotation_about(UP, 2.0 * np.pi * turn / TURNS) @ up
+            turned = mesh.vertices @ R.T
+            shift = goal - 0.5 * (turned.min(axis=0) + turned.max(axis=0))
+            shift[2] = points[:, 2].max() - turned[:, 2].max()  # tops together: the foot is not seen
+            tries.append(_iterate(few, samples, normals, tree, pose(R, shift), STEPS_TRY))
+        if min(error for error, _ in tries) < fits**2:
             break
-        R = rotation_about(UP, 2.0 * np.pi * turn / TURNS) @ up
-        turned = mesh.vertices @ R.T
-        shift = goal - 0.5 * (turned.min(axis=0) + turned.max(axis=0))
-        shift[2] = points[:, 2].max() - turned[:, 2].max()  # tops together: the foot is not seen
-        tries.append(_iterate(few, samples, normals, tree, pose(R, shift), STEPS_TRY))
     start = min(tries, key=lambda error_and_pose: error_and_pose[0])[1]
     _, T = _iterate(many, samples, normals, tree, start, STEPS_FINE)
     distance = np.sort(distance_to_mesh(transform(invert(T), many), mesh)[0])[: int(TRIM * len(many))]

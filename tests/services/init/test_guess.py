@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from schemas.job.assets import is_usable
-from schemas.scene.shape import Material, Part, Shape
+from schemas.scene.shape import Material, Mesh, Part, Shape
 from workers.assets.library.collection import SUFFIXES
 from workers.assets.library.copies import Item, find_copies, find_doubles
 from workers.assets.library.guess import find_joined, guess_groups, guess_ups, name_categories
@@ -261,7 +261,7 @@ def test_looks_differ_by_the_colours_where_faces_lie_and_not_by_how_the_thing_is
 
 def test_a_mirror_image_has_the_other_sign_however_it_is_turned_and_what_is_its_own_has_none():
     def handed(mesh):
-        return measure_handed(*(mesh.triangles[:, k] for k in range(3)))
+        return measure_handed(Mesh(mesh.vertices, mesh.faces))
 
     def with_arms(*arms):
         boxes = [trimesh.creation.box(bounds=bounds) for bounds in arms]
@@ -278,8 +278,8 @@ def test_a_mirror_image_has_the_other_sign_however_it_is_turned_and_what_is_its_
         )
         assert handed(left.copy().apply_transform(T @ np.diag([1, -1, 1, 1]))) == pytest.approx(-handed(left), rel=1e-6)
         assert abs(handed(with_arms([[0, 0, -1], [3, 1, 1]], [[2, 1, -1], [3, 3, 1]]).apply_transform(T))) < 1e-6
-    flat = np.random.default_rng(1).normal(size=(3, 9, 3)) * (1.0, 1.0, 0.0)
-    assert measure_handed(*flat) == measure_handed(*0 * flat) == 0.0
+    flat, faces = np.random.default_rng(1).normal(size=(27, 3)) * (1.0, 1.0, 0.0), np.arange(27).reshape(9, 3)
+    assert measure_handed(Mesh(flat, faces)) == measure_handed(Mesh(0 * flat, faces)) == 0.0
 
 
 def patterned_box(seed):

@@ -245,7 +245,7 @@ def _guess_rows(source: Path, making: Making, watch: Watch) -> list[Row]:
     surveys = survey_folder(source, asked[::every], making.limits, kept, watch)
     for survey in surveys:
         for part in set(survey.named) & set(paths):
-            if copies.pop(part, None) or part not in left_out:  # a file that names it is surer than its name
+            if part not in left_out or left_out[part].reason == COPY:  # a file that names it is surer than its name
                 left_out[part] = LeftOut(part, PART, f"part of {survey.path}")
     licences = list_licences(source)
     is_large = every > 1

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from schemas.base import Array
 from schemas.job.assets import UpAxis
-from schemas.scene.shape import MassProperties, Shape
+from schemas.scene.shape import MassProperties, Mesh, Shape
 from workers.assets.library.table import PLAIN
 from workers.assets.samples import colors_at, draw_points
 from workers.door.meshes.dae import find_up
@@ -183,17 +183,17 @@ def measure_shape(
         notes=(*notes, PLAIN) if is_plain(shape) else notes,
         up=None if fits is None else fits.axis,
         confidence=None if fits is None else fits.confidence,
-        area=0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()),
+        area=float(face_areas(shape.vertices, shape.faces).sum()),
         volume=abs(float((a * np.cross(b, c)).sum())) / 6.0,
-        handed=measure_handed(a, b, c),
+        handed=measure_handed(shape),
         look=sample_look(shape),
         unit_m=find_unit(path, math.dist(lower, upper)),
         stated_up=find_up(_head(path)) if path.suffix.lower() == ".dae" else None,
     )
 
 
-def measure_handed(a: Array, b: Array, c: Array) -> float:
-    """How far triangles with corners a, b and c [F, 3] are from their mirror image, which has the same of the other sign.
+def measure_handed(shape: Shape | Mesh) -> float:
+    """How far a surface is from its mirror image, which has the same of the other sign.
 
     The mean of x y z over the surface, along principal axes that form a right-handed frame, each by its standard deviation:
     turning two of the axes round leaves it as it is. 0 of what is its own mirror image, or flat. Exact, by four points of each
@@ -201,8 +201,8 @@ def measure_handed(a: Array, b: Array, c: Array) -> float:
     """
     inside = np.full((4, 3), 0.2) + 0.4 * np.eye(4, 3, -1)
     inside[0] = 1.0 / 3.0
-    points = np.einsum("pk,kfx->pfx", inside, np.stack([a, b, c])).reshape(-1, 3)
-    weights = np.outer((-27.0, 25.0, 25.0, 25.0), np.linalg.norm(np.cross(b - a, c - a), axis=1)).ravel()
+    points = np.einsum("pk,fkx->pfx", inside, shape.vertices[shape.faces]).reshape(-1, 3)
+    weights = np.outer((-27.0, 25.0, 25.0, 25.0), face_areas(shape.vertices, shape.faces)).ravel()
     weights = weights / max(weights.sum(), np.finfo(np.float64).tiny)
     centred = points - weights @ points
     squares, axes = np.linalg.eigh((centred * weights[:, None]).T @ centred)

@@ -51,14 +51,15 @@ class Visual:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What a file poses: what is seen of it, the names of all its meshes, and what collides, where that is known.
+    """What a file poses: what is seen of it, the names of all its meshes, and what collides, where a format tells it.
 
-    turns: whether its programs turn a glTF's y up to z: RViz (since 2025) and Drake do, Gazebo and MuJoCo do not.
+    collisions: reads them, which most files never need; turns: whether its programs turn a glTF's y up to z: RViz (since 2025)
+    and Drake do, Gazebo and MuJoCo do not.
     """
 
     visuals: tuple[Visual, ...]
     meshes: tuple[str, ...]
-    collisions: tuple[Visual, ...] = ()
+    collisions: Callable[[], Sequence[Visual]] = tuple
     turns: bool = False
 
 

@@ -52,7 +52,7 @@ def list_seen(path: Path, root: Path, limits: MeshLimits) -> tuple[list[Path], l
     source, model = read_model(path, root, limits)
     names = dict.fromkeys(visual.mesh for visual in model.visuals if visual.mesh is not None)
     pictures = dict.fromkeys(visual.texture for visual in model.visuals if visual.texture is not None)
-    collide = [one.mesh for one in model.collisions if one.mesh] if any(map(_is_gltf, model.visuals)) else []
+    collide = [one.mesh for one in model.collisions() if one.mesh] if any(map(_is_gltf, model.visuals)) else []
     return list(dict.fromkeys(map(source.demand, names))), [*source.files, *source.find_all([*pictures, *collide])]
 
 
@@ -71,13 +71,16 @@ def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
     def load(name: str) -> LoadedMesh:
         return load_shape(source.demand(name), limits, root, source.budget)
 
-    turn = _turn_of_gltf(model, load)
-    for visual in model.visuals:
-        body = wrap_body(visual.body) if visual.body is not None and visual.texture is not None else visual.body
-        loaded = load(visual.mesh or "") if body is None else LoadedMesh(Shape((body,)), ())
+    def shown(visual: Visual) -> LoadedMesh:
+        return load(visual.mesh or "") if visual.body is None else LoadedMesh(Shape((visual.body,)), ())
+
+    for visual in _with_turned_gltf(model, shown):
+        loaded = shown(visual)
         source.notes += [note for note in loaded.notes if not (visual.dresses and note.endswith(UNPAINTED))]
-        shape = Shape(tuple(wrap_body(part, True) for part in loaded.shape.parts)) if visual.by_side else loaded.shape
-        for part in transform_shape(shape, visual.T @ turn if _is_gltf(visual) else visual.T).parts:
+        shape = loaded.shape
+        if visual.by_side or (visual.body is not None and visual.texture is not None):
+            shape = Shape(tuple(wrap_body(part, visual.by_side) for part in shape.parts))
+        for part in transform_shape(shape, visual.T).parts:
             check_coordinates(path, part.vertices)
             dressed = with_jpeg(_dressed(part, visual, source), source)
             parts.append(replace(dressed, name=f"part{len(parts)}"))
@@ -91,28 +94,27 @@ def _is_gltf(visual: Visual) -> bool:
     return visual.mesh is not None and visual.mesh.lower().endswith((".glb", ".gltf"))
 
 
-def _turn_of_gltf(model: Model, load: Callable[[str], LoadedMesh]) -> Pose:
-    """[4, 4]: what takes a glTF's axes to those of what poses it: y up to z, or as they are.
+def _with_turned_gltf(model: Model, shown: Callable[[Visual], LoadedMesh]) -> Sequence[Visual]:
+    """What is seen, a glTF with its axes taken to those of what poses it: y up to z, or as they are.
 
     Programs differ, so that is taken which brings what is seen nearer to what collides, by their boxes; where nothing else than
     glTF collides, what `Model.turns` says.
     """
-    turns = [np.eye(4), pose(rotation_about(np.array([1.0, 0.0, 0.0]), 0.5 * np.pi), np.zeros(3))]
-    turns = turns[::-1] if model.turns else turns
+    if not any(map(_is_gltf, model.visuals)):
+        return model.visuals
+    up = pose(rotation_about(np.array([1.0, 0.0, 0.0]), 0.5 * np.pi), np.zeros(3))
+    turned = [replace(one, T=one.T @ up) if _is_gltf(one) else one for one in model.visuals]
+    ways = [turned, model.visuals] if model.turns else [model.visuals, turned]
 
-    def box(visuals: Sequence[Visual], turn: Pose) -> Array:
-        corners = list[Array]()
-        for visual in visuals:
-            shape = load(visual.mesh or "").shape if visual.body is None else Shape((visual.body,))
-            corners.extend(transform_shape(shape, visual.T @ turn if _is_gltf(visual) else visual.T).bounds)
-        return np.stack([np.min(corners, axis=0), np.max(corners, axis=0)])
+    def box(visuals: Sequence[Visual]) -> Array:
+        bounds = np.array([transform_shape(shown(visual).shape, visual.T).bounds for visual in visuals])
+        return np.stack([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
 
-    others = [one for one in model.collisions if not _is_gltf(one)]
-    if others and any(map(_is_gltf, model.visuals)):
+    if others := [one for one in model.collisions() if not _is_gltf(one)]:
         with suppress(MeshError):
-            collides = box(others, np.eye(4))
-            return min(turns, key=lambda turn: float(np.abs(box(model.visuals, turn) - collides).sum()))
-    return turns[0]
+            collides = box(others)
+            return min(ways, key=lambda way: float(np.abs(box(way) - collides).sum()))
+    return ways[0]
 
 
 def _dressed(part: Part, visual: Visual, source: Source) -> Part:
@@ -134,27 +136,33 @@ def read_urdf(source: Source) -> Model:
     """The visuals of all links of a URDF, joints at zero; the frame of the first root link."""
     path, robot = source.path, source.parse(source.path, ["robot"], "a URDF")
     looks = {m.get("name", ""): _look(path, m) for m in robot.iterfind("material")}
-    visuals, collisions = list[Visual](), list[Visual]()
-    for link, T_root_link in _link_poses(path, robot):
-        for collision in link.iterfind("collision"):
-            with suppress(MeshError):
-                T = T_root_link @ _origin(path, collision)
-                collides = read_geometry(path, collision, T, ElementTree.Element.get, "filename")
-                collisions += [] if collides is None else [collides]
+    links, visuals = _link_poses(path, robot), list[Visual]()
+
+    def read(element: ElementTree.Element, T_root_link: Pose) -> Visual | None:
+        return read_geometry(path, element, T_root_link @ _origin(path, element), ElementTree.Element.get, "filename")
+
+    def collisions() -> list[Visual]:
+        found = list[Visual]()
+        for link, T_root_link in links:
+            for element in link.iterfind("collision"):
+                with suppress(MeshError):
+                    collides = read(element, T_root_link)
+                    found += [] if collides is None else [collides]
+        return found
+
+    for link, T_root_link in links:
         for visual in link.iterfind("visual"):
             material = visual.find("material")
             look = (None, None) if material is None else _look(path, material)
             if material is not None and look[0] is None and look[1] is None:
                 look = looks.get(material.get("name", ""), look)
-            shown = read_geometry(
-                path, visual, T_root_link @ _origin(path, visual), ElementTree.Element.get, "filename"
-            )
+            shown = read(visual, T_root_link)
             if visual.find("geometry/*") is None:
                 raise MeshError("unreadable", f"{path} has a visual without geometry")
             if shown is not None:
                 visuals.append(replace(shown, colour=look[0], texture=look[1]))
     names = (mesh.get("filename", "") for mesh in robot.iterfind("link/*/geometry/mesh"))
-    return Model(tuple(visuals), tuple(dict.fromkeys(names)), tuple(collisions), turns=True)
+    return Model(tuple(visuals), tuple(dict.fromkeys(names)), collisions, turns=True)
 
 
 def _look(path: Path, material: ElementTree.Element) -> tuple[Array | None, str | None]:
@@ -206,13 +214,17 @@ def read_sdf(source: Source) -> Model:
             what = "is a world, and no object" if tag == "world" else f"has <{tag}>, which is not read"
             raise MeshError("format", f"{path} {what}: {remedy}")
     visuals = [visual for model in root.iterfind("model") for visual in _of_model(source, model, np.eye(4), 0)]
-    collisions = list[Visual]()
-    with suppress(MeshError):
-        for model in root.iterfind("model"):
-            collisions += _of_model(source, model, np.eye(4), 0, "collision")
+
+    def collisions() -> list[Visual]:
+        found = list[Visual]()
+        with suppress(MeshError):
+            for model in root.iterfind("model"):
+                found += _of_model(source, model, np.eye(4), 0, "collision")
+        return found
+
     names = dict.fromkeys((mesh.findtext("uri") or "").strip() for mesh in root.iterfind(".//geometry/mesh"))
     turns = any(name.startswith("package://") for name in names)  # Drake's; Gazebo has model://, and bare names
-    return Model(tuple(visuals), tuple(names), tuple(collisions), turns)
+    return Model(tuple(visuals), tuple(names), collisions, turns)
 
 
 def _of_model(
