@@ -36,8 +36,15 @@ def main(argv: list[str] | None = None) -> int:
     try:
         return _run(options)
     except KeyboardInterrupt:
-        print(f"verso: interrupted; {KEPT}", file=sys.stderr)
-        return 1
+        return _fail(options, f"interrupted; {KEPT}", "Interrupted", 1)
+
+
+def _fail(options: argparse.Namespace, message: str, kind: str, code: int) -> int:
+    """Tells why a command ended, to people and to who asked for `--json`; returns its exit code."""
+    print(f"verso: {message}", file=sys.stderr)
+    if getattr(options, "json", False):
+        print(json.dumps({"ok": False, "error": message, "kind": kind}))
+    return code
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -57,10 +64,7 @@ def _run(options: argparse.Namespace) -> int:
         message, out = str(error), getattr(options, "out", None)
         if out is not None:  # what reads a file does not know in whose dataset it lies
             message = message.replace("verso verify OUT", command_line("verify", out))
-        print(f"verso: {message}", file=sys.stderr)
-        if getattr(options, "json", False):
-            print(json.dumps({"ok": False, "error": message, "kind": type(error).__name__}))
-        return error.exit_code
+        return _fail(options, message, type(error).__name__, error.exit_code)
     except BrokenPipeError:
         return 1
     except OSError as error:
@@ -68,8 +72,7 @@ def _run(options: argparse.Namespace) -> int:
 
         if (remedy := remedy_of(error)) is None:
             raise
-        print(f"verso: {error.filename or 'a file'}: {remedy}", file=sys.stderr)
-        return 1
+        return _fail(options, f"{error.filename or 'a file'}: {remedy}", type(error).__name__, 1)
 
 
 def build_parser(program: str = "verso") -> argparse.ArgumentParser:

@@ -5,7 +5,6 @@ import re
 import time
 import uuid
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, TypeVar
 
@@ -25,7 +24,7 @@ from schemas.queue import (
 )
 from workers.door.opening import read_bytes
 from workers.store.local import open_store
-from workers.store.store import Events, Store, retry_if_swept
+from workers.store.store import Events, Store, map_ahead, retry_if_swept
 
 JobState = Literal["queued", "waiting", "running", "cancelling", "cancelled", "done", "failed", "lost"]
 """waiting: for its output folder. lost: drivers died more often than they are started again."""
@@ -122,9 +121,6 @@ def applies(view: JobView, event: JobEvent) -> bool:
 
 Model = TypeVar("Model", bound=Frozen)
 
-AT_ONCE: Final = 16
-"""Requests at once, where many jobs are read."""
-
 OWN: Final = {STAGING, LOCK_FILE, MANIFEST, "lost+found"}
 """What may stand in a folder that is about to become a queue: what somebody who makes it at this moment has put there."""
 
@@ -187,15 +183,18 @@ class Queue:
     def read_all(self, ids: Iterable[str]) -> tuple[list[JobView], dict[str, str]]:
         """The jobs as they are now; what cannot be read is told by id. A job whose request is not there yet is left out."""
         views, faults = [], {}
-        with ThreadPoolExecutor(AT_ONCE) as pool:
-            for job, read in [(job, pool.submit(self.read, job)) for job in ids]:
-                try:
-                    views.append(read.result())
-                except InputError:
-                    continue
-                except CorruptError as error:
-                    faults[job] = str(error)
+        for job, found in map_ahead(self.store, self._read_or_fault, ids):
+            if isinstance(found, JobView):
+                views.append(found)
+            elif isinstance(found, CorruptError):
+                faults[job] = str(found)
         return views, faults
+
+    def _read_or_fault(self, job: str) -> tuple[str, JobView | InputError | CorruptError]:
+        try:
+            return job, self.read(job)
+        except (InputError, CorruptError) as error:
+            return job, error
 
     def append(self, job: str, kind: Any, attempt: int = 0, **fields: Any) -> JobView | None:
         """Adds an event to a job and returns the job after it; None where the event does not apply to it any more.

@@ -1,6 +1,7 @@
 """The commands as typed: exit codes, what they print for people and, in the last line, for programs, and refusals in one line."""
 
 import argparse
+import errno
 import json
 import os
 import shlex
@@ -8,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -114,6 +116,18 @@ def test_bad_input_is_told_by_key_value_and_remedy(capsys, tmp_path, monkeypatch
         assert code == 2 and all(word in text for word in words), text
         assert list(tmp_path.iterdir()) == []
     assert answer(capsys, "run", "nowhere.yaml")[2]["kind"] == "JobError"
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [(OSError(errno.ENOSPC, "", "x"), "x: the disk is full"), (KeyboardInterrupt(), "interrupted; ")],
+    ids=["a full disk", "an interrupt"],
+)
+def test_what_ends_a_command_from_outside_is_an_answer_too(error, told, monkeypatch, capsys):
+    monkeypatch.setattr("services.cli.queue_commands.open_queue", Mock(side_effect=error))
+    code, lines, found = answer(capsys, "jobs", "--queue", "anywhere")
+    assert (code, lines, found["ok"]) == (1, [], False)
+    assert found["error"].startswith(told)
 
 
 READERS = "status *|verify *|query * 'select 1'|replay * 3|report *|export * new --format bop|score * .|score . *"
