@@ -298,6 +298,32 @@ def test_an_sdf_is_read_as_its_poses_say_and_what_it_does_not_hold_is_named(tmp_
     assert named == {"cube.obj", "hull.obj"}, "collision shapes are parts too"
 
 
+OUTLINED = """<sdf version="1.6"><model name="m"><link name="l"><pose>0 0 1 0 0 0</pose>
+<collision name="c"><geometry><heightmap><uri>ground.png</uri></heightmap></geometry></collision>
+<visual name="v"><geometry>{}</geometry></visual></link></model></sdf>"""
+
+
+def outline(*points: tuple[float, float]) -> str:
+    return f"<polyline><height>0.5</height>{''.join(f'<point>{x} {y}</point>' for x, y in points)}</polyline>"
+
+
+def ring(half: float) -> list[tuple[float, float]]:
+    return [(-half, -half), (half, -half), (half, half), (-half, half)]
+
+
+def test_an_sdf_s_outline_stands_on_its_plane_with_its_holes_and_what_is_in_them(tmp_path):
+    """Three squares in one another, one that ends where it began, and an L beside them that goes round the other way."""
+    corner = [(9.0, 0.0), (9.0, 2.0), (10.0, 2.0), (10.0, 1.0), (11.0, 1.0), (11.0, 0.0)]
+    drawn = [outline(*ring(3.0), ring(3.0)[0]), outline(*ring(2.0)), outline(*ring(1.0)), outline(*corner)]
+    path = write(tmp_path / "model.sdf", OUTLINED.format("".join(drawn)))
+    (part,) = load_posed(path, LIMITS, tmp_path).shape.parts
+    mesh = trimesh.Trimesh(part.vertices, part.faces)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(0.5 * (36 - 16 + 4 + 3))
+    assert mesh.bounds == pytest.approx(np.array([[-3.0, -3.0, 1.0], [11.0, 3.0, 1.5]]))
+    points = [(0.0, 0.0, 1.2), (1.5, 0.0, 1.2), (2.5, 0.0, 1.2), (10.5, 1.5, 1.2), (9.5, 1.5, 1.2)]
+    assert mesh.contains(points).tolist() == [True, False, True, False, True]
+
+
 def test_an_mjcf_is_read_with_what_it_includes_as_mujoco_has_it(tmp_path):
     write(tmp_path / "m/cube.obj", CUBE)
     write(
@@ -392,6 +418,10 @@ WRONG = (
         "unreadable",
         "<torus> is not known",
     ),
+    ("a.sdf", OUTLINED.format(outline((0, 0), (1, 1), (1, 0), (0, 1))), "unreadable", "crosses itself"),
+    ("a.sdf", OUTLINED.format(outline(*ring(1)) + outline((0, 0), (2, 0), (2, 2))), "unreadable", "or another one"),
+    ("a.sdf", OUTLINED.format(outline((0, 0), (1, 1))), "unreadable", "encloses nothing"),
+    ("a.sdf", OUTLINED.format("<heightmap/>"), "format", "has <heightmap>, which is not read"),
     ("a.sdf", "<sdf/>", "no_faces", "no visual geometry"),
     ("a.xml", "<mujoco/>", "no_faces", "no visual geometry"),
     ("a.xml", '<mujoco><include file="b.xml"/></mujoco>', "missing", "names 'b.xml'"),

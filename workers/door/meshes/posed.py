@@ -9,7 +9,9 @@ from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
+import shapely
 import trimesh
+from manifold3d import CrossSection, FillRule
 
 from schemas.base import Array, Pose, frozen_array
 from schemas.errors import MeshError
@@ -109,7 +111,14 @@ class Source(FolderResolver):
             yield from (folder / tail for tail in tails for folder in above)
 
 
-_COUNTED = {"link": "links", "joint": "joints", "visual": "visuals", "body": "bodies", "geom": "geoms"}
+_COUNTED = {
+    "link": "links",
+    "joint": "joints",
+    "visual": "visuals",
+    "body": "bodies",
+    "geom": "geoms",
+    "polyline": "polylines",
+}
 
 MOST_TAILS = 32
 """Folders of a name that may be passed over."""
@@ -206,6 +215,8 @@ def read_geometry(
             return Visual(T @ scale, (value_of(file) or "").strip())
         if kind.tag in ("plane", "empty"):
             return None
+        if kind.tag == "polyline":
+            return Visual(T, body=_extrude(path, list(visual.iterfind("geometry/polyline"))))
         sizes = [numbers(path, value_of(name), count, positive=True) for name, count in _SIZES.get(kind.tag, ())]
         if any((size == 0.0).any() for size in sizes):
             return None
@@ -220,6 +231,26 @@ _SIZES = {
     **dict.fromkeys(("cylinder", "capsule"), (("radius", 1), ("length", 1))),
 }
 """The sizes of bodies in URDF and SDF, and how many numbers each is."""
+
+
+def _extrude(path: Path, polylines: Sequence[ElementTree.Element]) -> Part:
+    """The body above outlines, from z = 0 up to their height: one inside another is a hole in it, one in a hole a body again.
+
+    MeshError `unreadable` where they cross, or enclose nothing.
+    """
+    height = float(numbers(path, polylines[0].findtext("height"), 1, positive=True)[0])
+    points = [[numbers(path, point.text, 2) for point in polyline.iterfind("point")] for polyline in polylines]
+    outlines = [np.array(outline) for outline in points if len(outline) > 2]
+    if not shapely.MultiLineString([np.concatenate([one, one[:1]]) for one in outlines]).is_simple:
+        raise MeshError(
+            "unreadable", f"{path} has a <polyline> that crosses itself or another one, and so has no inside"
+        )
+    mesh = CrossSection(outlines, FillRule.EvenOdd).extrude(height).to_mesh64()
+    if not len(mesh.tri_verts):
+        raise MeshError(
+            "unreadable", f"{path} has a <polyline> that encloses nothing: it needs three points and a height"
+        )
+    return Part("polyline", frozen_array(mesh.vert_properties[:, :3]), frozen_array(mesh.tri_verts, np.int32), DEFAULT)
 
 
 def scaled(path: Path, scale: Array) -> Pose:

@@ -201,9 +201,9 @@ def _origin(path: Path, element: ElementTree.Element) -> Pose:
 
 _NOT_READ = {
     **dict.fromkeys(("world", "include"), "init its models' own files"),
-    **dict.fromkeys(("submesh", "heightmap", "polyline"), "export it as one mesh"),
+    **dict.fromkeys(("visual//submesh", "visual//heightmap"), "export it as one mesh"),
 }
-"""What an SDF may have and is not read, with the remedy."""
+"""What an SDF may have and is not read, by its path, with the remedy."""
 
 
 def read_sdf(source: Source) -> Model:
@@ -211,7 +211,7 @@ def read_sdf(source: Source) -> Model:
     path, root = source.path, source.parse(source.path, ["sdf"], "an SDF")
     for tag, remedy in _NOT_READ.items():
         if root.find(f".//{tag}") is not None:
-            what = "is a world, and no object" if tag == "world" else f"has <{tag}>, which is not read"
+            what = "is a world, and no object" if tag == "world" else f"has <{tag.split('/')[-1]}>, which is not read"
             raise MeshError("format", f"{path} {what}: {remedy}")
     visuals = [visual for model in root.iterfind("model") for visual in _of_model(source, model, np.eye(4), 0)]
 
