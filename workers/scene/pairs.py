@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from schemas.base import Array
 from schemas.dataset.layout import file_pose_id, input_pose_id
-from schemas.errors import ViewError
+from schemas.errors import ViewError, plural
 from schemas.job.cameras import Mirror
+from schemas.job.job import Job
 from schemas.job.views import Images
 from schemas.scene.scene import EffectPlan, PosedScene, ScenePlan
 from schemas.scene.shape import is_object
@@ -51,8 +52,9 @@ def front_distance(depth_m: Array, object_pixels: NDArray[np.bool_] | np.bool_, 
     """
     z = depth_m[object_pixels & (depth_m > 0.0)]
     if z.size == 0:
-        remedy = "narrow start.offset_m, or aim the cameras at it"
-        raise ViewError("object_not_seen", f"the input view has no depth pixel of the object: {remedy}")
+        raise ViewError(
+            "object_not_seen", "the input view has no depth pixel of the object: go nearer, or leave it out"
+        )
     return float(np.percentile(z, mirror.percentile))
 
 
@@ -83,6 +85,7 @@ def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
             require_room(role, near, scene.plan, scene.posed.things, moves)
             beside.append(sense(scene, render_view(scene, role, number, near, sight), number))
     assert first.region is not None
+    _require_seen(job, exact_input, first)
     pair = Pair(object_distance(first.depth, first.region, images, job.cameras.mirror), first, tuple(beside))
     if not effects.runs("mirror"):
         return pair
@@ -105,6 +108,31 @@ def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
         filled, hidden = projection_shares(depth, mirror.depth, images)
     projected = View("projected", first.pose_id, first.pose_id, mirror_camera, rgb, depth, None, ())
     return replace(pair, projected=projected, filled_share=filled, hidden_share=hidden)
+
+
+def _require_seen(job: Job, exact: View, stored: View) -> None:
+    """Raises ViewError `object_not_seen` with the cause where a stored view has no depth of the object."""
+    assert exact.region is not None and stored.region is not None
+    if stored.depth[is_object(stored.region)].any():
+        return
+    seen, noise = is_object(exact.region), job.sensor.depth_noise
+    z = dequantise_depth(exact.depth[seen], job.images)
+    z, pixels = z[z > 0.0], f"the object has {plural(int(seen.sum()), 'pixel')} in the input view"
+    if not seen.any():
+        aim = "narrow start.offset_m, or aim the cameras at it" if job.scene == "tabletop" else "see cameras.orbit"
+        why = f"the input view does not show the object, which is beside the picture or behind other things: {aim}"
+    elif not z.size:
+        low, high = job.images.depth_range_m
+        why = f"{pixels}, all nearer or farther than images.depth_range_m [{low:g}, {high:g}]: widen that"
+    elif noise is not None and not ((z > noise.range_m.low) & (z < noise.range_m.high)).any():
+        low, high = noise.range_m
+        why = (
+            f"{pixels}, {z.min():.3g} to {z.max():.3g} m away, and sensor.depth_noise measures from {low:g} to {high:g} m: "
+            "change cameras.orbit.radius_m, or sensor.depth_noise.range_m"
+        )
+    else:
+        why = f"{pixels}, and sensor.depth_noise leaves none of them depth: bring the camera nearer (cameras.orbit.radius_m)"
+    raise ViewError("object_not_seen", why)
 
 
 def make_further(scene: SettledScene, pair: Pair, number: int) -> Iterator[View]:

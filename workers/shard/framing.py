@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 
-from schemas.base import Pose
+from schemas.base import Pose, Range
 from schemas.errors import InputError, SceneError
 from schemas.job.job import Job
 from schemas.scene.scene import ObjectStart, Table
@@ -65,17 +65,22 @@ def _unseen(job: Job, start: ObjectStart, T_world_obj: Pose, camera: Camera) -> 
         sides["cameras.mirror.T_z_m"] = ("mirror", opposite, job.cameras.mirror.T_z_m)
     for key, (role, seen_by, given) in sides.items():
         value = f"{given:g}" if isinstance(given, float) else given
-        local, (near, far), k = (
-            transform(invert(seen_by.T_world_cam), points),
-            job.images.depth_range_m,
-            seen_by.intrinsics,
-        )
+        local, k = transform(invert(seen_by.T_world_cam), points), seen_by.intrinsics
         where = f"the {role} camera has the object {local[:, 2].min():.3g} to {local[:, 2].max():.3g} m before it"
-        there = local[(local[:, 2] > near) & (local[:, 2] < far)]
-        if not len(there):
-            return f"{where}, outside images.depth_range_m [{near:g}, {far:g}]: change {key}, which is {value}"
+        there = local
+        for kept, (near, far) in _depth_ranges(job).items():
+            there = there[(there[:, 2] > near) & (there[:, 2] < far)]
+            if not len(there):
+                return f"{where}, outside {kept} [{near:g}, {far:g}]: change {key}, which is {value}"
         pixels = zip(project(there, k), (k.width, k.height), strict=True)
         if min(np.ptp(np.clip(at, 0.0, most)) for at, most in pixels) < 1.0:
             look = f"see cameras.sensor, start.offset_m and {key} ({value})"
             return f"{where}, beside its picture or smaller than a pixel: {look}"
     return ""
+
+
+def _depth_ranges(job: Job) -> dict[str, Range]:
+    """By key: what bounds the depth that is stored."""
+    noise = job.sensor.depth_noise
+    ranges = {"images.depth_range_m": job.images.depth_range_m}
+    return ranges if noise is None else {**ranges, "sensor.depth_noise.range_m": noise.range_m}

@@ -81,6 +81,10 @@ def test_what_is_left_and_its_cost_are_told_and_nothing_is_made(tmp_path):
             },
             r"camera a, number 0, has the objects 0\.\d+ to 0\.\d+ m before it, .* 0\.8 to 8 m: widen images.* or set studio",
         ),
+        (
+            {"sensor.depth_noise.range_m": [0.5, 1.5]},
+            r"the input camera .* outside sensor\.depth_noise\.range_m \[0\.5, 1\.5\]: change cameras\.orbit\.radius_m",
+        ),
         ({"start.offset_m": [3, 4]}, r"none of 21 positions .* narrow start\.offset_m"),
     ],
 )

@@ -6,11 +6,14 @@ import platform
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from schemas.base import set_key
+from schemas.errors import ViewError
 from schemas.job.job import Job
 from schemas.job.views import Images, Patch
 from schemas.scene.view import Camera, Intrinsics, ObjectLabel, Pair, View
@@ -29,6 +32,37 @@ ROOT = Path(__file__).resolve().parents[3]
 def three() -> Made:
     """One pair of three objects."""
     return make(Setting({"objects_per_scene": 3}))
+
+
+UNSEEN = (
+    ({"cameras.orbit.aim_m": [1.5, 1.5]}, "does not show the object, .*: narrow start.offset_m, or aim the cameras"),
+    (
+        {"images.depth_range_m": [0.2, 1.0]},
+        r"\d+ pixels in the input view, all nearer .* images.depth_range_m \[0.2, 1\]",
+    ),
+    (
+        {"sensor.depth_noise.range_m": [0.5, 1.5]},
+        r"\d+ pixels in the input view, [12]\.\d+ to 2\.\d+ m away, and sensor.depth_noise measures from 0.5 to 1.5 m: ",
+    ),
+    (
+        {
+            "sensor.depth_noise.edge_px": 8,
+            "sensor.depth_noise.edge_dropout": 1.0,
+            "sensor.depth_noise.grazing_deg": 0.01,
+        },
+        "leaves none of them depth",
+    ),
+)
+
+
+@pytest.mark.parametrize(("keys", "words"), UNSEEN, ids=[next(iter(keys)) for keys, _ in UNSEEN])
+def test_a_scene_whose_input_has_no_depth_of_the_object_says_why(keys, words):
+    changes = dict[str, Any]()
+    for key, value in keys.items():
+        set_key(changes, key, value)
+    with pytest.raises(ViewError, match=words) as caught:
+        make(Setting(changes))
+    assert caught.value.reason == "object_not_seen"
 
 
 # ---------------------------------------------------------------------------------------------- rows
