@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import AfterValidator, Field, Tag, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, Tag, field_validator, model_validator
 
 from schemas.base import Folder, Frozen, Positive, PositiveInt, Seed, Share, Weight, among_kinds
 from schemas.errors import did_you_mean
@@ -108,6 +108,21 @@ def _of_objects(name: str) -> str:
 
 CategoryName = Annotated[str, Field(max_length=1000), AfterValidator(_of_objects)]
 """A category of objects: any name that can be a folder's."""
+
+
+def _equal_weights(value: object) -> object:
+    """A list of names as names with equal weights."""
+    if not isinstance(value, list):
+        return value
+    if not all(isinstance(name, str) for name in value):
+        raise ValueError("must be a list of names, or names with weights")
+    if len(set(value)) != len(value):
+        raise ValueError("names a category twice")
+    return dict.fromkeys(value, 1.0)
+
+
+CategoryWeights = Annotated[dict[CategoryName, Weight], BeforeValidator(_equal_weights)]
+"""Categories with their weights; a list gives equal weights."""
 
 SurfaceName = Annotated[
     str, Field(max_length=1000), AfterValidator(lambda name: name if name == TABLE else _of_objects(name))

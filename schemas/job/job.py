@@ -13,14 +13,14 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, Field, model_validator
 
-from schemas.base import Folder, Frozen, NonNegativeInt, Positive, PositiveInt, Seed, Share, Weight, with_defaults
+from schemas.base import Folder, Frozen, NonNegativeInt, Positive, PositiveInt, Seed, Share, with_defaults
 from schemas.job.assets import (
     CATEGORIES,
     TABLE,
     Assets,
-    CategoryName,
+    CategoryWeights,
     describe_unknown,
     offered_by,
     sources_of,
@@ -201,7 +201,7 @@ class Job(Frozen):
     or of a scene in the BOP layout (docs/scenes.md)."""
     objects_per_scene: ObjectCount = ONE_OBJECT
     """Objects on the table; a range is drawn from evenly. The first gives the scene's category."""
-    categories: dict[CategoryName, Weight] = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
+    categories: CategoryWeights = Field(default_factory=lambda: dict.fromkeys(CATEGORIES, 1.0), min_length=1)
     """Weights of the categories that the sources offer; a list gives equal weights."""
     assets: Assets = Assets()
     """Where shapes come from."""
@@ -240,17 +240,6 @@ class Job(Frozen):
         if not isinstance(value, dict):
             return value
         return with_categories(with_preset(with_kind_keys(with_capture_keys(value))))
-
-    @field_validator("categories", mode="before")
-    @classmethod
-    def _from_list(cls, value: object) -> object:
-        if isinstance(value, list):
-            if not all(isinstance(name, str) for name in value):
-                raise ValueError("must be a list of names, or names with weights")
-            if len(set(value)) != len(value):
-                raise ValueError("names a category twice")
-            return dict.fromkeys(value, 1.0)
-        return value
 
     @model_validator(mode="after")
     def _has_ids(self) -> "Job":

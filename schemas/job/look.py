@@ -11,12 +11,11 @@ from schemas.base import (
     Interval,
     Range,
     Share,
-    Weight,
     among_kinds,
     read_counts,
     write_counts,
 )
-from schemas.job.assets import CategoryName
+from schemas.job.assets import CategoryWeights
 from schemas.job.cameras import OneOrRange
 from schemas.job.physics import ObjectCount
 
@@ -133,8 +132,8 @@ class Clutter(Frozen):
 
     count: ObjectCount = Counts(1, 4)
     """How many; a range is drawn from evenly, and fewer stand where there is no room."""
-    categories: dict[CategoryName, Weight] | None = Field(default=None, min_length=1)
-    """Weights of their categories; by default the job's."""
+    categories: CategoryWeights | None = Field(default=None, min_length=1)
+    """Weights of their categories, or a list of them; by default the job's."""
 
 
 class Look(Frozen):

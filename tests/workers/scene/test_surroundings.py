@@ -158,7 +158,7 @@ ALL_TARGETS = {"views": ["normals", "coordinates", "albedo", "covisible", "amoda
 
 @pytest.mark.minute
 def test_clutter_is_in_images_masks_and_depth_and_has_no_row():
-    clutter: dict[str, Any] = {"clutter": {"count": 3, "categories": {"box": 1}}}
+    clutter: dict[str, Any] = {"clutter": {"count": 3, "categories": ["box"]}}
     changes = {"targets": ALL_TARGETS, "check": {"raycast_share": 1.0}, "objects_per_scene": 2}
     plain, made = make(Setting(changes)), make(Setting({**changes, "look": clutter}))
     drawn: Any = made.rows["scenes"][0]["surroundings"]
