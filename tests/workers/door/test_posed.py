@@ -235,6 +235,45 @@ def test_the_materials_that_come_with_gazebo_have_their_colours(tmp_path):
         assert ("Gazebo/Wood is not had" in "; ".join(loaded.notes)) == (name == "Wood"), "its picture is not here"
 
 
+MESH, BOX = "<mesh><uri>cube.obj</uri></mesh>", "<box><size>1 1 1</size></box>"
+GREY = "<script><uri>file://media/materials/scripts/gazebo.material</uri><name>Gazebo/Grey</name></script>"
+LOST = "<script><uri>lost.material</uri><name>M/Lost</name></script>"
+STATED = "<diffuse>0 1 0 1</diffuse>"
+
+
+@pytest.mark.parametrize(
+    ("geometry", "own", "material", "colour"),
+    [
+        (BOX, "", STATED, (0, 255, 0)),
+        (BOX, "", GREY + STATED, (0, 255, 0)),  # as Gazebo's editor of models writes it
+        (BOX, "", LOST + STATED, (0, 255, 0)),
+        (MESH, "Kd 0 0 1", "", (0, 0, 255)),
+        (MESH, "Kd 0 0 1", STATED, (0, 255, 0)),
+        (MESH, "Kd 0 0 1", GREY + STATED, (0, 255, 0)),
+        (MESH, "Kd 0 0 1", GREY, (178, 178, 178)),
+        (MESH, "map_Kd skin.png", STATED, (200, 0, 0)),
+        (MESH, "map_Kd skin.png", GREY + STATED, (0, 255, 0)),
+        (MESH, "map_Kd skin.png", "<pbr><metal><albedo_map>other.png</albedo_map></metal></pbr>", (0, 0, 200)),
+    ],
+)
+def test_a_colour_that_an_sdf_states_is_over_a_script_s_and_over_the_one_colour_of_a_mesh(
+    geometry, own, material, colour, tmp_path
+):
+    for name, shown in (("skin.png", (200, 0, 0)), ("other.png", (0, 0, 200))):
+        Image.fromarray(np.full((16, 16, 3), shown, np.uint8)).save(tmp_path / name)
+    files = textured_obj()
+    write_all(tmp_path, {**files, "cube.mtl": f"newmtl skin\n{own}\n".encode()})
+    sdf = f'<sdf version="1.6"><model name="m"><link name="l"><visual name="v"><geometry>{geometry}</geometry>'
+    sdf += f"<material>{material}</material>{{}}</visual></link></model></sdf>"
+    loaded = load_posed(write(tmp_path / "model.sdf", sdf.format("")), LIMITS, tmp_path)
+    assert {tuple(c) for c in seen(loaded.shape)} == {colour} and not loaded.notes
+    faded = write(tmp_path / "model.sdf", sdf.format("<transparency>0.4</transparency>"))
+    (part,) = load_posed(faded, LIMITS, tmp_path).shape.parts
+    assert part.material.base_color[3] == pytest.approx(0.6)
+    with pytest.raises(MeshError, match="no visual geometry"):
+        load_posed(write(tmp_path / "model.sdf", sdf.format("<transparency>1</transparency>")), LIMITS, tmp_path)
+
+
 def _strip_materials(tree):
     del tree["materials"], tree["meshes"][0]["primitives"][0]["material"]
 

@@ -24,7 +24,7 @@ SHAPES = "shapes"
 VERSION = 1
 """Of a library: raised where an older one cannot be read as it is."""
 
-PLAIN = "no picture and no colour, drawn in one grey"
+PLAIN = "no picture, and no colour but one grey"
 """A note on a shape."""
 
 UNKNOWN = "unknown"

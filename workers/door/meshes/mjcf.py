@@ -174,7 +174,7 @@ def _visual(document: _Document, geom: Attributes, T: Pose, meshes: Mapping[str,
         _rotation(document.numbers(given, "refquat", "1 0 0 0")), document.numbers(given, "refpos", "0 0 0")
     )
     T = T @ scaled(document.path, document.numbers(given, "scale", "1 1 1")) @ np.linalg.inv(reference)
-    return Visual(T, _file_of(document, mesh, "meshdir"), None, colour, texture, True, by_side)
+    return Visual(T, _file_of(document, mesh, "meshdir"), None, colour, texture, "all", by_side)
 
 
 def _look(document: _Document, geom: Attributes) -> tuple[Array | None, str | None, bool]:

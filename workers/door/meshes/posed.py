@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
+from typing import Literal
 from urllib.parse import unquote
 from xml.etree import ElementTree
 
@@ -37,9 +38,9 @@ MOST_ABOVE = 256
 class Visual:
     """One thing that a file poses: a mesh by the name of its file, or a simple body.
 
-    T: affine, [4, 4], to the frame of the whole, metres; colour: sRGB and alpha; texture: the name of a picture; dresses:
-    whether these replace what the mesh has of its own, and are not only for what has none; by_side: whether the picture is on
-    each of six sides, by direction, and not by the mesh's coordinates.
+    T: affine, [4, 4], to the frame of the whole, metres; colour: sRGB and alpha; texture: the name of a picture; dresses: what
+    of the mesh these replace: what is bare of any look, also what is plain, of one colour without a picture, or all; by_side:
+    whether the picture is on each of six sides, by direction, and not by the mesh's coordinates; opacity: of all of it.
     """
 
     T: Pose
@@ -47,8 +48,9 @@ class Visual:
     body: Part | None = None
     colour: Array | None = None
     texture: str | None = None
-    dresses: bool = False
+    dresses: Literal["bare", "plain", "all"] = "bare"
     by_side: bool = False
+    opacity: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,13 +76,13 @@ def load_posed(path: Path, limits: MeshLimits, root: Path) -> LoadedMesh:
 
     for visual in _with_turned_gltf(model, shown):
         loaded = shown(visual)
-        source.notes += [note for note in loaded.notes if not (visual.dresses and note.endswith(UNPAINTED))]
+        source.notes += [note for note in loaded.notes if not (visual.dresses == "all" and note.endswith(UNPAINTED))]
         shape = loaded.shape
         if visual.by_side or (visual.body is not None and visual.texture is not None):
             shape = Shape(tuple(wrap_body(part, visual.by_side) for part in shape.parts))
         for part in transform_shape(shape, visual.T).parts:
             check_coordinates(path, part.vertices)
-            dressed = with_jpeg(_dressed(part, visual, source), source)
+            dressed = with_jpeg(_faded(_dressed(part, visual, source), visual.opacity), source)
             parts.append(replace(dressed, name=f"part{len(parts)}"))
             vertices, faces = vertices + len(part.vertices), faces + len(part.faces)
         check_nodes(path, len(parts), "parts", limits)
@@ -119,8 +119,9 @@ def _with_turned_gltf(model: Model, shown: Callable[[Visual], LoadedMesh]) -> Se
 
 def _dressed(part: Part, visual: Visual, source: Source) -> Part:
     """The part in the colour and picture that the file gives it."""
-    has_look = part.material is not DEFAULT or part.colors is not None
-    if (visual.colour is None and visual.texture is None) or (has_look and not visual.dresses):
+    is_plain = part.material.texture is None and part.colors is None
+    replaced = {"all": True, "plain": is_plain, "bare": is_plain and part.material is DEFAULT}[visual.dresses]
+    if not replaced or (visual.colour is None and visual.texture is None):
         return part
     texture = None if visual.texture is None else source.picture(visual.texture)
     if texture is not None and part.uv is None:
@@ -130,6 +131,14 @@ def _dressed(part: Part, visual: Visual, source: Source) -> Part:
         return part
     red, green, blue, alpha = (1.0, 1.0, 1.0, 1.0) if visual.colour is None else visual.colour.tolist()
     return replace(part, material=Material((red, green, blue, alpha or 1.0), texture=texture), colors=None)
+
+
+def _faded(part: Part, opacity: float) -> Part:
+    """The part with its alpha times that."""
+    if opacity == 1.0:
+        return part
+    red, green, blue, alpha = part.material.base_color
+    return replace(part, material=replace(part.material, base_color=(red, green, blue, alpha * opacity)))
 
 
 def read_urdf(source: Source) -> Model:
@@ -238,15 +247,32 @@ def _of_model(
         for visual in link.iterfind(kind):
             T_visual = T @ _sdf_pose(path, link) @ _sdf_pose(path, visual)
             shown = read_geometry(path, visual, T_visual, ElementTree.Element.findtext, "uri")
-            script = visual.find("material/script")
-            if shown is not None and script is not None and (look := _read_script(source, script)) is not None:
-                yield replace(shown, colour=look[0], texture=look[1], dresses=True)
-            elif shown is not None:
-                albedo = visual.findtext("material/pbr/metal/albedo_map")
-                colour = _colour(path, visual.findtext("material/diffuse"))
-                yield replace(shown, colour=colour, texture=albedo and albedo.strip())
+            if shown is not None and (worn := _worn(source, visual, shown)).opacity > 0.0:
+                yield worn
     for inner in model.iterfind("model"):
         yield from _of_model(source, inner, T, depth + 1, kind)
+
+
+def _worn(source: Source, visual: ElementTree.Element, shown: Visual) -> Visual:
+    """What a visual shows in the look that it states, as Gazebo has it: a script's, and over its colour the one of `diffuse`."""
+    colour, script, look = (
+        _colour(source.path, visual.findtext("material/diffuse")),
+        visual.find("material/script"),
+        None,
+    )
+    albedo = visual.findtext("material/pbr/metal/albedo_map")
+    if script is not None and (look := _read_script(source, script)) is None and colour is None:
+        name = (script.findtext("name") or "").strip()
+        source.notes.append(f"the material script {name:.80} is not had, or has no colour: {UNPAINTED}")
+    scripted, picture = look or (None, None)
+    hidden = float(numbers(source.path, visual.findtext("transparency") or "0", 1)[0])
+    return replace(
+        shown,
+        colour=scripted if colour is None else colour,
+        texture=picture or (albedo and albedo.strip()),
+        dresses="all" if look or albedo else "plain",
+        opacity=1.0 - min(max(hidden, 0.0), 1.0),
+    )
 
 
 def _colour(path: Path, text: str | None) -> Array | None:
@@ -281,7 +307,7 @@ _GAZEBO: Mapping[str, tuple[float, float, float]] = {
 
 
 def _read_script(source: Source, script: ElementTree.Element) -> tuple[Array | None, str | None] | None:
-    """Colour and picture of the Ogre material that a visual names, first pass first; None, and a note, where it is not had.
+    """Colour and picture of the Ogre material that a visual names, first pass first; None where it is not had.
 
     After the manual of Ogre 1.9, "Material Scripts"; what a material has of another (`:`) is not read.
     """
@@ -307,7 +333,6 @@ def _read_script(source: Source, script: ElementTree.Element) -> tuple[Array | N
             return colour, picture[1] if there is None else relpath(there, source.path.parent)
     if name.startswith("Gazebo/") and (known := _GAZEBO.get(name.removeprefix("Gazebo/"))):
         return np.array([*known, 1.0]), None
-    source.notes.append(f"the material script {name:.80} is not had, or has no colour: {UNPAINTED}")
     return None
 
 
