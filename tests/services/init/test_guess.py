@@ -164,6 +164,9 @@ def test_up_follows_the_files_that_are_sure_and_a_specification_unless_most_of_a
         mixed = guess_ups([item(f"{k}{suffix}", up="xyz"[k % 3]) for k in range(6)])
         assert "though 4 of 6 stand on another axis alone" in mixed[f"{'xyz'.index(axis)}{suffix}"][1]
         assert fits[f"5{suffix}"][0] == ("y" if suffix == ".glb" else "x"), "but a robot's file may lie on its side"
+    for suffix, axis in ((".sdf", "z"), (".stl", "x")):
+        fits = ups(*(item(f"{k}{suffix}") for k in range(5)), item(f"5{suffix}", up="x", rests_on_z=True))
+        assert fits[f"5{suffix}"] == axis, "one that rests as its file has it is left so, where z is up by use"
     stated = [item(f"{k}.dae", stated_up="y") for k in range(3)]
     assert ups(*stated, item("z.dae", stated_up="z"))["z.dae"] == "z", "as each file says"
     assert ups(*stated, item("s.dae", up="x", stated_up="y"))["s.dae"] == "y", "one file alone may be mistaken"

@@ -13,7 +13,7 @@ from tests.kit.shapes import shape_of
 from tests.workers.assets.libraries import open_folder
 from tests.workers.door.oracles import CUBE, support_margin, welded, write
 from workers.assets.builtin.make import make_asset
-from workers.assets.library.placement import Upright, find_upright, measure_stand
+from workers.assets.library.placement import Upright, find_upright, measure_stand, rests
 from workers.assets.library.reading import UP_AXES, place_asset
 from workers.assets.library.table import Row
 from workers.assets.mass import mass_properties, shell_mass, weigh
@@ -335,6 +335,30 @@ def test_round_bodies_stand_on_their_flat_end_and_nothing_is_said_of_what_stands
     boxes = trimesh.creation.box((0.2, 0.1, 0.3)), trimesh.creation.box((0.1, 0.1, 0.1))
     for mesh in (*boxes, trimesh.creation.icosphere(3, 0.1), trimesh.creation.capsule(0.2, 0.05)):
         assert upright(mesh) is None
+
+
+def test_what_neither_tips_nor_rolls_away_rests_whatever_its_foot_is():
+    """A remote control on its rounded back and a laptop do; a can or a mug on its side does not, nor a plate on its rim."""
+    back = trimesh.creation.cylinder(0.1, 0.16, sections=256)
+    back = back.slice_plane((0.09, 0, 0), (1, 0, 0), cap=True)
+    lid = trimesh.creation.box((0.3, 0.005, 0.25), trimesh.transformations.translation_matrix((0, 0.12, 0.13)))
+    laptop = trimesh.util.concatenate([trimesh.creation.box((0.3, 0.24, 0.02)), lid])
+    handle = trimesh.creation.box((0.02, 0.02, 0.08), trimesh.transformations.translation_matrix((0.05, 0, 0)))
+    tube = trimesh.creation.cylinder(0.04, 0.1, sections=64)
+    for name, mesh, up, so in (
+        ("remote on its flat side", back, (-1, 0, 0), True),
+        ("remote on its back", back, (1, 0, 0), True),
+        ("remote on its end", back, (0, 0, 1), False),
+        ("laptop", laptop, (0, 0, 1), True),
+        ("laptop on its lid's end", laptop, (0, 0, -1), False),
+        ("can", tube, (0, 0, 1), True),
+        ("can on its side", tube, (1, 0, 0), False),
+        ("mug on its side", trimesh.util.concatenate([tube, handle]), (0, 1, 0), False),
+        ("plate on its rim", trimesh.creation.box((0.3, 0.3, 0.01)), (1, 0, 0), False),
+    ):
+        for axis in ("x", "y", "z"):
+            turn = trimesh.geometry.align_vectors(up, np.eye(3)["xyz".index(axis)])[:3, :3]
+            assert rests(mesh.convex_hull.vertices @ turn.T, mesh.center_mass @ turn.T, axis) == so, (name, axis)
 
 
 def test_the_angle_of_tipping_is_that_of_the_foot_and_the_centre_of_mass():

@@ -123,6 +123,25 @@ def measure_stand(hull_vertices: Array, com: Array, up: str) -> Stand:
     return Stand(inside[0] / half_width, inside[1] / half_width, leans[0], leans[1])
 
 
+LEAN_DEG, RISES = 20.0, 0.08
+"""A shape rests where every lean by this much lifts its centre of mass by this share of what it would lift that of a wide box. A
+can on its side rises by -0.02 to 0.01, a remote control on its rounded back by 0.25, an open laptop on its feet by 0.12."""
+
+
+def rests(hull_vertices: Array, com: Array, up: UpAxis) -> bool:
+    """Whether the shape, with that axis up, neither tips over nor rolls away: its centre of mass lies lowest so, all about."""
+    axis = "xyz".index(up)
+    around = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    lean = math.radians(LEAN_DEG)
+    directions = np.roll(
+        np.stack([np.cos(around), np.sin(around), np.full(24, 1.0 / math.tan(lean))], axis=1), axis - 2, axis=1
+    )
+    below = com - hull_vertices
+    rise = (directions @ below.T).max(axis=1).min() * math.sin(lean) - below[:, axis].max()
+    half_width = _depth_inside(np.delete(hull_vertices, axis, axis=1), np.delete(com, axis))
+    return bool(rise > RISES * half_width * math.sin(lean))
+
+
 def _depth_inside(points: Array, point: Array) -> float:
     """How far a point [2] lies inside the convex hull of points [N, 2]; 0 where that has no area, negative outside."""
     if len(points) < 3:
@@ -148,7 +167,8 @@ class Measured:
     area, volume: of its surface, and between the surface and the middle of its bounding box, in the same units; handed: as
     `measure_handed`; textures: how many pictures its parts have; look: its colours by place, as `sample_look`, None where it has
     none; unit_m, stated_up: its unit in metres and the axis that is up, where the file says so; up, confidence: what its shape
-    tells about the axis that is up, or None.
+    none; unit_m, stated_up: its unit in metres and the axis that is up, where the file says so; up, confidence: what its shape
+    tells about the axis that is up, or None; rests_on_z: as `rests` of z.
     """
 
     extents: tuple[float, float, float]
@@ -164,6 +184,7 @@ class Measured:
     look: tuple[float, ...] | None = None
     unit_m: float | None = None
     stated_up: UpAxis | None = None
+    rests_on_z: bool = False
 
 
 def measure_shape(
@@ -189,6 +210,7 @@ def measure_shape(
         look=sample_look(shape),
         unit_m=find_unit(path, math.dist(lower, upper)),
         stated_up=find_up(_head(path)) if path.suffix.lower() == ".dae" else None,
+        rests_on_z=rests(hull_vertices, mass.com, "z"),
     )
 
 
