@@ -296,7 +296,7 @@ def _measured(row: Row, survey: Survey, why: str, units: Sequence[str]) -> Row:
     assert survey.measured is not None
     measured = survey.measured
     x, y, z = (row.unit * extent for extent in measured.extents)
-    rests = row.up == "z" != measured.up and measured.rests_on_z
+    doubted = row.up == "z" and measured.up != "z" and measured.rests_on_z
     return replace(
         row,
         why="; ".join(
@@ -307,7 +307,7 @@ def _measured(row: Row, survey: Survey, why: str, units: Sequence[str]) -> Row:
         watertight=measured.watertight,
         pictures=measured.textures,
         shape_up=measured.up,
-        sure=None if measured.confidence is None else measured.confidence == "sure" and not rests,
+        sure=None if measured.confidence is None else measured.confidence == "sure" and not doubted,
         mended=measured.notes,
     )
 
