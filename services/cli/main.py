@@ -2,7 +2,6 @@
 
 import argparse
 import importlib
-import json
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
@@ -14,7 +13,7 @@ from schemas.errors import VersoError, command_line, needs_making
 from services.cli.arguments import Command, Parser
 from services.cli.environment import enter_stack_environment, speak_as_typed, typed_program
 from services.cli.rows import COMMANDS, JSON, KEPT, THERE
-from services.run.supervisor import supervise
+from services.run.supervisor import supervise, tell_failure
 
 if TYPE_CHECKING:
     Commands = argparse._SubParsersAction[Parser]
@@ -40,10 +39,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _fail(options: argparse.Namespace, message: str, kind: str, code: int) -> int:
-    """Tells why a command ended, to people and to who asked for `--json`; returns its exit code."""
-    print(f"verso: {message}", file=sys.stderr)
-    if getattr(options, "json", False):
-        print(json.dumps({"ok": False, "error": message, "kind": kind}))
+    tell_failure(message, kind, getattr(options, "json", False))
     return code
 
 

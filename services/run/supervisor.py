@@ -109,6 +109,13 @@ def supervise(command: Callable[[], int], kept: str, quiet: bool = True, answers
     return front.tend(lambda: keeper.tend(lambda: _drive(command, words, mask)))
 
 
+def tell_failure(line: str, kind: str, answers: bool) -> None:
+    """Tells the user why a command ended, and in the last line of `--json` the program that waits for an answer."""
+    print(f"verso: {line}", file=sys.stderr)
+    if answers:
+        print(json.dumps({"ok": False, "error": line, "kind": kind}))
+
+
 def _set_mark() -> str:
     """The line in the environments of all that the command starts. It leaves the mark of a run that started this one."""
     environ, name = os.environ, MARK  # noqa: TID251 - what the command starts inherits it, and is known by it
@@ -179,10 +186,11 @@ class _Layer:
     def _say(self, line: str) -> None:
         """Tells the user, and the program that waits for an answer, how the command ended."""
         with contextlib.suppress(OSError):  # a terminal that was closed
-            wipe = "\r\x1b[K" if sys.stderr.isatty() else ""  # a bar that its process could not end
-            print(f"{wipe}verso: {line}", file=sys.stderr, flush=True)
-            if self.answers:
-                print(json.dumps({"ok": False, "error": line, "kind": "Ended"}), flush=True)
+            if sys.stderr.isatty():
+                print("\r\x1b[K", end="", file=sys.stderr)  # a bar that its process could not end
+            tell_failure(line, "Ended", self.answers)
+            sys.stderr.flush()
+            sys.stdout.flush()
 
     def _wait(self, child: int) -> tuple[int, int | None]:
         """The child's wait status, and the first signal that it was ended by, if any."""

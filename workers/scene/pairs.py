@@ -85,8 +85,11 @@ def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
             require_room(role, near, scene.plan, scene.posed.things, moves)
             beside.append(sense(scene, render_view(scene, role, number, near, sight), number))
     assert first.region is not None
-    _require_seen(job, exact_input, first)
-    pair = Pair(object_distance(first.depth, first.region, images, job.cameras.mirror), first, tuple(beside))
+    try:
+        d_z_m = object_distance(first.depth, first.region, images, job.cameras.mirror)
+    except ViewError as error:
+        raise ViewError(error.reason, _why_unseen(job, exact_input)) from error
+    pair = Pair(d_z_m, first, tuple(beside))
     if not effects.runs("mirror"):
         return pair
     with stopwatch.effect("mirror"):
@@ -110,29 +113,26 @@ def make_pair(scene: SettledScene, camera: Camera, number: int) -> Pair:
     return replace(pair, projected=projected, filled_share=filled, hidden_share=hidden)
 
 
-def _require_seen(job: Job, exact: View, stored: View) -> None:
-    """Raises ViewError `object_not_seen` with the cause where a stored view has no depth of the object."""
-    assert exact.region is not None and stored.region is not None
-    if stored.depth[is_object(stored.region)].any():
-        return
+def _why_unseen(job: Job, exact: View) -> str:
+    """Why a view has no depth of the object as it is stored, and what to do; exact: the view before the sensor's effects."""
+    assert exact.region is not None
     seen, noise = is_object(exact.region), job.sensor.depth_noise
-    z = dequantise_depth(exact.depth[seen], job.images)
-    z, pixels = z[z > 0.0], f"the object has {plural(int(seen.sum()), 'pixel')} in the input view"
     if not seen.any():
         aim = "narrow start.offset_m, or aim the cameras at it" if job.scene == "tabletop" else "see cameras.orbit"
-        why = f"the input view does not show the object, which is beside the picture or behind other things: {aim}"
-    elif not z.size:
+        return f"the input view does not show the object, which is beside the picture or behind other things: {aim}"
+    z = dequantise_depth(exact.depth[seen], job.images)
+    z, pixels = z[z > 0.0], f"the object has {plural(int(seen.sum()), 'pixel')} in the input view"
+    if not z.size:
         low, high = job.images.depth_range_m
-        why = f"{pixels}, all nearer or farther than images.depth_range_m [{low:g}, {high:g}]: widen that"
-    elif noise is not None and not ((z > noise.range_m.low) & (z < noise.range_m.high)).any():
+        return f"{pixels}, all nearer or farther than images.depth_range_m [{low:g}, {high:g}]: widen that"
+    if noise is not None and not ((z > noise.range_m.low) & (z < noise.range_m.high)).any():
         low, high = noise.range_m
-        why = (
-            f"{pixels}, {z.min():.3g} to {z.max():.3g} m away, and sensor.depth_noise measures from {low:g} to {high:g} m: "
-            "change cameras.orbit.radius_m, or sensor.depth_noise.range_m"
-        )
-    else:
-        why = f"{pixels}, and sensor.depth_noise leaves none of them depth: bring the camera nearer (cameras.orbit.radius_m)"
-    raise ViewError("object_not_seen", why)
+        measures = f"sensor.depth_noise measures from {low:g} to {high:g} m"
+        remedy = "change cameras.orbit.radius_m, or sensor.depth_noise.range_m"
+        return f"{pixels}, {z.min():.3g} to {z.max():.3g} m away, and {measures}: {remedy}"
+    return (
+        f"{pixels}, and sensor.depth_noise leaves none of them depth: bring the camera nearer (cameras.orbit.radius_m)"
+    )
 
 
 def make_further(scene: SettledScene, pair: Pair, number: int) -> Iterator[View]:

@@ -238,7 +238,7 @@ def guess_ups(items: Sequence[Item], doubles: Sequence[Item] = ()) -> dict[str, 
             if axis is not None and axis != whole[0] and count > (1 if specified is None else 2):
                 ups |= {item.path: (axis, f"{message}, unlike other {suffix} files") for item in inside}
         for item in group if not stated and specified != "y" else ():  # in robots' files z is up by use alone
-            sure = _sure_of(item, specified)
+            sure = item.measured.sure_of(specified)
             if sure is not None and sure != ups[item.path][0]:
                 ups[item.path] = sure, "stands on this axis alone, unlike its neighbours"
     return ups
@@ -270,7 +270,7 @@ def _decide(items: Sequence[Item], specified: UpAxis | None) -> tuple[UpAxis, st
     if axis is not None:
         return axis, message
     if specified is not None:
-        against = sum(_sure_of(item, specified) not in (None, specified) for item in items)
+        against = sum(item.measured.sure_of(specified) not in (None, specified) for item in items)
         return specified, "by the format's specification" + (
             f", though {against} of {len(items)} stand on another axis alone: look at the pictures"
             if against
@@ -286,23 +286,12 @@ def _decide(items: Sequence[Item], specified: UpAxis | None) -> tuple[UpAxis, st
     return "z", "not known: the shapes stand on several axes or on none; look at the pictures"
 
 
-def _sure_of(item: Item, specified: UpAxis | None) -> UpAxis | None:
-    """The axis that a file's shape is sure of; None where it rests with the z that its format or itself has up.
-
-    An open laptop stands so, though on small feet, and lies on its side too; a remote control lies on its rounded back.
-    """
-    measured = item.measured
-    if measured.confidence != "sure" or (specified == "z" and measured.up != "z" and measured.rests_on_z):
-        return None
-    return measured.up
-
-
 def _majority(items: Sequence[Item], specified: UpAxis | None) -> tuple[UpAxis | None, int, str]:
     """The axis that enough files are sure of, None where none is; how many are sure of it or of another; and the reason.
 
     Enough are most of those that are sure; against a specification, most of all files.
     """
-    votes = Counter(axis for item in items if (axis := _sure_of(item, specified)) is not None)
+    votes = Counter(axis for item in items if (axis := item.measured.sure_of(specified)) is not None)
     axis, count = votes.most_common(1)[0] if votes else (None, 0)
     message = (
         f"sure: {count} of {len(items)} stand on {'this axis' if specified is None else axis} alone"

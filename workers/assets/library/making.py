@@ -296,7 +296,6 @@ def _measured(row: Row, survey: Survey, why: str, units: Sequence[str]) -> Row:
     assert survey.measured is not None
     measured = survey.measured
     x, y, z = (row.unit * extent for extent in measured.extents)
-    doubted = row.up == "z" and measured.up != "z" and measured.rests_on_z
     return replace(
         row,
         why="; ".join(
@@ -307,7 +306,7 @@ def _measured(row: Row, survey: Survey, why: str, units: Sequence[str]) -> Row:
         watertight=measured.watertight,
         pictures=measured.textures,
         shape_up=measured.up,
-        sure=None if measured.confidence is None else measured.confidence == "sure" and not doubted,
+        sure=None if measured.confidence is None else measured.sure_of(row.up) is not None,
         mended=measured.notes,
     )
 

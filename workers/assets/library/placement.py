@@ -167,7 +167,6 @@ class Measured:
     area, volume: of its surface, and between the surface and the middle of its bounding box, in the same units; handed: as
     `measure_handed`; textures: how many pictures its parts have; look: its colours by place, as `sample_look`, None where it has
     none; unit_m, stated_up: its unit in metres and the axis that is up, where the file says so; up, confidence: what its shape
-    none; unit_m, stated_up: its unit in metres and the axis that is up, where the file says so; up, confidence: what its shape
     tells about the axis that is up, or None; rests_on_z: as `rests` of z.
     """
 
@@ -185,6 +184,15 @@ class Measured:
     unit_m: float | None = None
     stated_up: UpAxis | None = None
     rests_on_z: bool = False
+
+    def sure_of(self, kept: UpAxis | None) -> UpAxis | None:
+        """The axis that the shape is sure of; None where it is not, or rests with z up and that is the one that is `kept`.
+
+        An open laptop rests so, though on small feet, and stands on its side too; a remote control lies on its rounded back.
+        """
+        if self.confidence != "sure" or (kept == "z" and self.up != "z" and self.rests_on_z):
+            return None
+        return self.up
 
 
 def measure_shape(

@@ -255,12 +255,9 @@ def _of_model(
 
 def _worn(source: Source, visual: ElementTree.Element, shown: Visual) -> Visual:
     """What a visual shows in the look that it states, as Gazebo has it: a script's, and over its colour the one of `diffuse`."""
-    colour, script, look = (
-        _colour(source.path, visual.findtext("material/diffuse")),
-        visual.find("material/script"),
-        None,
-    )
+    colour = _colour(source.path, visual.findtext("material/diffuse"))
     albedo = visual.findtext("material/pbr/metal/albedo_map")
+    script, look = visual.find("material/script"), None
     if script is not None and (look := _read_script(source, script)) is None and colour is None:
         name = (script.findtext("name") or "").strip()
         source.notes.append(f"the material script {name:.80} is not had, or has no colour: {UNPAINTED}")
