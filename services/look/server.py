@@ -202,7 +202,7 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, follower: Follower, place: Place) -> None:
         self.follower = follower
         self.address_family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
-        self._free = threading.BoundedSemaphore(MOST_REQUESTS)
+        self._open = set[Any]()
         super().__init__((place.host, place.port), _Handler)
         names = {"localhost", socket.gethostname().lower(), place.host.lower()}
         self.gate = Gate(frozenset(names), place.token, f"verso_{self.server_address[1]}")
@@ -214,7 +214,8 @@ class _Server(ThreadingHTTPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Answers in a thread, or closes the connection where too many are open."""
-        if self._free.acquire(blocking=False):
+        if len(self._open) < MOST_REQUESTS:  # only this thread adds to them
+            self._open.add(request)
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
@@ -226,8 +227,12 @@ class _Server(ThreadingHTTPServer):
         except Exception:
             self.handle_error(request, client_address)
         finally:
-            self._free.release()  # before the connection closes: who sees it closed may open the next at once
+            self.free(request)
             self.shutdown_request(request)
+
+    def free(self, request: Any) -> None:
+        """Counts a connection no longer; before it closes, because who sees it closed may open the next at once."""
+        self._open.discard(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Says nothing of a connection that the reader closed."""
@@ -242,20 +247,23 @@ class _Handler(BaseHTTPRequestHandler):
 
     def handle_one_request(self) -> None:
         """Reads one request and answers it, whatever its method."""
-        with self._hangs_up_after(STALLED_S):
+        with self._hangs_up_after(STALLED_S, is_waiting=True):
             self.raw_requestline = self.rfile.readline(65_537)
             if not self.raw_requestline or len(self.raw_requestline) > 65_536:
                 self.close_connection = True
                 return
             is_request = self.parse_request()
         if is_request:
-            with self._hangs_up_after(ANSWER_S):
+            with self._hangs_up_after(ANSWER_S, is_waiting=False):
                 self._answer()
 
     @contextlib.contextmanager
-    def _hangs_up_after(self, seconds: float) -> Iterator[None]:
-        """Closes the connection if the block takes longer: a limit of each read would begin anew with each byte."""
-        timer = threading.Timer(seconds, self._hang_up)
+    def _hangs_up_after(self, seconds: float, is_waiting: bool) -> Iterator[None]:
+        """Closes the connection if the block takes longer: a limit of each read would begin anew with each byte.
+
+        is_waiting: whether the block does nothing but wait for the reader, so that it ends with the connection.
+        """
+        timer = threading.Timer(seconds, self._hang_up, [is_waiting])
         timer.daemon = True
         timer.start()
         try:
@@ -263,7 +271,9 @@ class _Handler(BaseHTTPRequestHandler):
         finally:
             timer.cancel()
 
-    def _hang_up(self) -> None:
+    def _hang_up(self, is_waiting: bool) -> None:
+        if is_waiting:
+            self.server.free(self.connection)
         with contextlib.suppress(OSError):  # it is closed already
             self.connection.shutdown(socket.SHUT_RDWR)
 
